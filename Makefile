@@ -1,37 +1,68 @@
 # uavrl: `make help` lists the targets. A fresh machine needs Python 3.11 or newer and make.
 
-PYTHON    ?= python3
-PIP_FLAGS ?=
-JOBS      ?= 2
+PYTHON       ?= python3
+PIP_FLAGS    ?=
+EXTRAS       ?= dev
+JOBS         ?= 2
 PYTEST_FLAGS ?=
+DEMO_FLAGS   ?=
 
+comma := ,
 VENV  := .venv
-PY    := $(VENV)/bin/python
-STAMP := $(VENV)/.installed
-
-export OMP_NUM_THREADS ?= 1
-export MPLBACKEND ?= Agg
+BIN   := $(VENV)/bin
+STAMP := $(VENV)/.installed-$(subst $(comma),-,$(EXTRAS))
+DOCUMENTATION := tests/test_documentation.py
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help setup $(VENV) test test-all check format demo clean
 
 help:  ## list the targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 	@echo
-	@echo "  Variables: PYTHON=python3.12   the interpreter to build .venv with (3.11 or newer)"
-	@echo "             PIP_FLAGS='...'     extra options of pip install, for example an index of CPU builds of torch"
-	@echo "             JOBS=2              worker processes of the tests"
-	@echo "             PYTEST_FLAGS='...'  extra options of pytest"
+	@echo "  PYTHON=python3.12    interpreter that builds .venv (3.11 or newer)"
+	@echo "  PIP_FLAGS='...'      options of pip install, for example an index with CPU builds of torch"
+	@echo "  EXTRAS=dev,export    extras of the package to install"
+	@echo "  JOBS=2               worker processes of the tests"
+	@echo "  PYTEST_FLAGS='...'   options of pytest, for example -k energy"
+	@echo "  DEMO_FLAGS='...'     options of the demonstration"
 
-setup: $(STAMP)  ## build .venv, with what development needs
+setup: $(STAMP)  ## build .venv with all that development needs
 
 $(VENV): $(STAMP)
 
-$(STAMP): pyproject.toml constraints.txt
+# __init__.py holds the version, which the installed metadata repeats.
+$(STAMP): pyproject.toml constraints.txt src/uavrl/__init__.py
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
-	  echo "uavrl needs Python 3.11 or newer; '$(PYTHON)' is $$($(PYTHON) --version 2>&1)." >&2; \
-	  echo "Name another interpreter: make PYTHON=python3.12 ..." >&2; exit 1; }
-	test -x $(PY) || $(PYTHON) -m venv $(VENV)
-	$(PY) -m pip install --quiet --constraint constraints.txt $(PIP_FLAGS) --editable '.[dev]'
+	  echo "uavrl needs Python 3.11 or newer; $(PYTHON) is '$$($(PYTHON) --version 2>&1)'." >&2; \
+	  echo "Name another interpreter: make PYTHON=python3.12" >&2; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt $(PIP_FLAGS) --editable '.[$(EXTRAS)]'
 	@touch $@
+
+# One thread a process: the workers already fill the cores. No display is needed.
+test test-all check: export OMP_NUM_THREADS := 1
+test test-all check: export MPLBACKEND := Agg
+
+test: $(STAMP)  ## run the tests, slow ones left out
+	$(BIN)/python -m pytest -m "not slow" -n $(JOBS) --dist worksteal --ignore $(DOCUMENTATION) $(PYTEST_FLAGS)
+
+test-all: $(STAMP)  ## run every test
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal --ignore $(DOCUMENTATION) $(PYTEST_FLAGS)
+
+check: $(STAMP)  ## lint, format, types, and the code blocks of the documentation
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy src tests $(wildcard examples)
+	$(BIN)/python -m pytest --quiet $(DOCUMENTATION)
+
+format: $(STAMP)  ## mend what ruff can mend
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+demo: $(STAMP)  ## learn a small policy from logged flights and watch it
+	$(BIN)/python -m uavrl demo $(DEMO_FLAGS)
+
+clean:  ## remove .venv, caches and builds
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
+	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
