@@ -1,0 +1,1 @@
+"""Pure functions of arrays, one per equation, for NumPy and torch alike (Array API); units in the names."""

@@ -1,0 +1,1 @@
+"""The simulator: state, dynamics, observations and its Gymnasium environments."""

@@ -1,0 +1,166 @@
+"""The simulator's one step: a pure function of arrays, batch first, without random numbers inside."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from array_api_compat import array_namespace
+
+from uavrl.physics import age, channel, energy
+from uavrl.scenario import Area, Scenario, hover_reference_j
+from uavrl.simulation.state import Draws, FlightAction, Outcome, SimState
+
+Array = Any  # a NumPy array or torch tensor; the Array API has no common type to name
+
+
+def initial_state(position_m: Array, devices: int) -> SimState:
+    """All ages, energies and clocks 0 at `position_m` (N, 2) (m)."""
+    xp = array_namespace(position_m)
+    count = position_m.shape[0]
+    zero = xp.zeros_like(position_m[:, 0])
+    ages = xp.zeros((count, devices), dtype=position_m.dtype, device=position_m.device)
+    steps = xp.zeros((count,), dtype=xp.int64, device=position_m.device)
+    return SimState(position_m=position_m, age_s=ages, energy_j=zero, used_j=zero, time_s=zero, step=steps)
+
+
+def _fly(position_m: Array, displacement_m: Array, d_max: float, area: Area) -> Array:
+    """Position after a move of at most d_max under the scenario's border rule (N, 2) (m)."""
+    xp = array_namespace(position_m)
+    length = xp.sqrt(xp.sum(displacement_m * displacement_m, axis=1))
+    scale = d_max / xp.clip(length, d_max, None)
+    target = position_m + displacement_m * scale[:, None]
+    size = xp.asarray([area.width_m, area.depth_m], dtype=position_m.dtype, device=position_m.device)
+    if area.border == "reflect":
+        return size - xp.abs(xp.remainder(target, 2.0 * size) - size)
+    clipped = xp.clip(target, xp.zeros_like(size), size)
+    if area.border == "clip":
+        return clipped
+    inside = xp.all(clipped == target, axis=1)  # "mirroring" in the paper: the move is cancelled at no cost
+    return xp.where(inside[:, None], target, position_m)
+
+
+def _transmit(
+    scenario: Scenario, layout_m: Array, position_m: Array, device: Array, draws: Draws
+) -> tuple[Array, Array, Array]:
+    """(snr, rate in bit/s, packet in bits) of the link to `device` - 1, each (N,); an idle row's values mean nothing."""
+    xp = array_namespace(position_m)
+    index = xp.clip(device - 1, 0, None)
+    where = xp.take_along_axis(layout_m, xp.broadcast_to(index[:, None, None], (index.shape[0], 1, 2)), axis=1)[:, 0]
+    offset = where - position_m
+    link = scenario.channel
+    elevation, los, snr = channel.link_snr(xp.sqrt(xp.sum(offset * offset, axis=1)), link)
+    if link.fading == "rayleigh":
+        snr = snr * channel.fading_power(draws.scatter, xp.zeros_like(snr))
+    elif link.fading == "rician":
+        factor = xp.where(draws.sight < los, channel.rician_factor(elevation, link), xp.zeros_like(snr))
+        snr = snr * channel.fading_power(draws.scatter, factor)
+    if link.fading == "ergodic":
+        rate = channel.ergodic_rate_bps(snr, link.bandwidth_hz)
+    else:
+        rate = channel.rate_bps(snr, link.bandwidth_hz)
+    bits = scenario.traffic.packet_bits
+    if isinstance(bits, tuple):
+        return snr, rate, xp.take(xp.asarray(bits, dtype=snr.dtype, device=snr.device), index, axis=0)
+    return snr, rate, xp.full_like(snr, bits)
+
+
+def advance(
+    scenario: Scenario,
+    layout_m: Array,
+    state: SimState,
+    action: FlightAction,
+    draws: Draws,
+    decision_s: Array | None = None,
+) -> tuple[SimState, Outcome]:
+    """One step of every environment: move, then serve from the new position.
+
+    Args:
+        scenario: what is flown.
+        layout_m: (N, K, 2) device positions.
+        state: N environments.
+        action: wanted displacement and device.
+        draws: this step's randomness.
+        decision_s: (N,) measured T_exec, used where the scenario's `decision_time` is "measured".
+
+    Returns:
+        The state after the step and what happened in it.
+    """
+    xp = array_namespace(state.position_m)
+    frame, objective, limits, traffic = scenario.airframe, scenario.objective, scenario.limits, scenario.traffic
+    zero = xp.zeros_like(state.time_s)
+
+    position = _fly(state.position_m, action.displacement_m, frame.max_displacement_m, scenario.area)
+    moved = position - state.position_m
+    move_s = xp.sqrt(xp.sum(moved * moved, axis=1)) / frame.speed_mps
+
+    wants = action.device > 0
+    snr, rate, bits = _transmit(scenario, layout_m, position, action.device, draws)
+    transmission_s = channel.transmission_s(bits, rate)
+    limit_s = scenario.channel.max_transmission_s
+    outage = zero > 1.0
+    if limit_s is not None:
+        outage = wants & (transmission_s > limit_s)
+        transmission_s = xp.clip(transmission_s, 0.0, limit_s)
+    transmission_s = xp.where(wants, transmission_s, zero)
+    arrived = wants & ~outage
+
+    decide_s = zero + frame.decision_s if decision_s is None or frame.decision_time == "fixed" else decision_s
+    duration_s = move_s + transmission_s + decide_s  # eq. (time_total)
+    if frame.min_idle_s > 0:
+        duration_s = xp.where(wants, duration_s, xp.clip(duration_s, frame.min_idle_s, None))
+
+    move_j = energy.move_energy_j(move_s, frame)
+    communication_j = energy.communication_energy_j(transmission_s, frame)
+    idle_j = energy.idle_energy_j(duration_s - move_s - transmission_s, frame)
+    total_j = move_j + communication_j + idle_j  # eq. (energy_total)
+
+    devices = xp.arange(1, layout_m.shape[1] + 1, dtype=action.device.dtype, device=action.device.device)
+    reset = arrived[:, None] & (action.device[:, None] == devices)
+    ages = age.next_age_s(state.age_s, reset, duration_s, traffic.max_age_s)
+    cost = ages
+    if objective.reward == "per_second":
+        cost = age.age_integral_s2(state.age_s, duration_s, traffic.max_age_s)
+    if traffic.priority is None:
+        weighted = xp.mean(cost, axis=1)
+    else:
+        weighted = xp.sum(cost * xp.asarray(traffic.priority, dtype=cost.dtype, device=cost.device), axis=1)
+    age_term = weighted / objective.age_reference_s
+    energy_term = total_j / hover_reference_j(scenario, energy.hover_power_w(frame))
+    reward = -(objective.age_weight * age_term + (1.0 - objective.age_weight) * energy_term)  # eq. (reward)
+
+    after = SimState(
+        position_m=position,
+        age_s=ages,
+        energy_j=total_j,
+        used_j=state.used_j + total_j,
+        time_s=state.time_s + duration_s,
+        step=state.step + 1,
+    )
+    terminated = outage & False if limits.energy_budget_j is None else after.used_j > limits.energy_budget_j
+    truncated = outage & False
+    if limits.max_steps is not None:
+        truncated = truncated | (after.step >= limits.max_steps)
+    if limits.time_budget_s is not None:
+        truncated = truncated | (after.time_s > limits.time_budget_s)
+    outcome = Outcome(
+        reward=reward,
+        age_term=age_term,
+        energy_term=energy_term,
+        displacement_m=moved,
+        duration_s=duration_s,
+        move_s=move_s,
+        transmission_s=transmission_s,
+        snr=xp.where(wants, snr, zero),
+        rate_bps=xp.where(wants, rate, zero),
+        energy_j=total_j,
+        energy_move_j=move_j,
+        energy_communication_j=communication_j,
+        energy_idle_j=idle_j,
+        device_energy_j=transmission_s * scenario.channel.transmit_power_w,
+        bits=xp.where(arrived, bits, zero),
+        served=arrived,
+        outage=outage,
+        terminated=terminated,
+        truncated=truncated & ~terminated,
+    )
+    return after, outcome

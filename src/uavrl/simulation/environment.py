@@ -1,0 +1,296 @@
+"""Gymnasium environments around the one simulator: a single one and a native vector of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike, NDArray
+
+from uavrl.errors import ScenarioError
+from uavrl.scenario import Scenario, load_scenario
+from uavrl.simulation.dynamics import advance, initial_state
+from uavrl.simulation.observations import (
+    DEVICE_ENTRIES,
+    UAV_ENTRIES,
+    ObservationKind,
+    devices_observation,
+    paper_observation,
+)
+from uavrl.simulation.state import Draws, FlightAction, Outcome, SimState
+
+Float = NDArray[np.float64]
+Observation = Any  # (N, K+3) array, or a dict of arrays, as the observation space says
+
+_LARGEST = float(np.finfo(np.float32).max)
+
+
+def check_layout(layout: ArrayLike, scenario: Scenario) -> Float:
+    """Device positions as a (K, 2) float64 array (m).
+
+    Raises:
+        ScenarioError: wrong shape, not finite, or outside the area.
+    """
+    return _check_positions(layout, (scenario.traffic.devices, 2), "layout", scenario)
+
+
+def _check_positions(values: ArrayLike, shape: tuple[int, ...], what: str, scenario: Scenario) -> Float:
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ScenarioError(f"{what} is no array of numbers, allowed: shape {shape} in metres") from None
+    if array.shape != shape:
+        raise ScenarioError(f"{what} has shape {array.shape}, allowed: {shape} (x, y in metres)")
+    size = np.array([scenario.area.width_m, scenario.area.depth_m])
+    bad = ~np.isfinite(array) | (array < 0) | (array > size)
+    if bad.any():
+        index = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise ScenarioError(f"{what}{list(index)} = {array[index]:g} lies outside the area 0..{size[index[-1]]:g} m")
+    return array
+
+
+def random_positions(generator: np.random.Generator, shape: tuple[int, ...], scenario: Scenario) -> Float:
+    """Uniform positions in the area, `shape` ending in 2 (m)."""
+    return generator.random(shape) * np.array([scenario.area.width_m, scenario.area.depth_m])
+
+
+def draw(generator: np.random.Generator, count: int) -> Draws:
+    """One step's randomness for `count` environments."""
+    return Draws(scatter=generator.standard_normal((count, 2)), sight=generator.random(count))
+
+
+def observe(kind: ObservationKind, scenario: Scenario, layout_m: Float, state: SimState) -> Observation:
+    """The batched float32 observation of `kind`: (N, K+3), or {"uav": (N, 4), "devices": (N, K, 6)}."""
+    if kind == "paper":
+        return paper_observation(state.position_m, state.age_s, state.energy_j).astype(np.float32)
+    seen = devices_observation(scenario, layout_m, state.position_m, state.age_s, state.energy_j, state.used_j)
+    return {"uav": seen.uav.astype(np.float32), "devices": seen.devices.astype(np.float32)}
+
+
+def observation_space(kind: ObservationKind, scenario: Scenario) -> spaces.Space[Any]:
+    """Space of one environment's observation.
+
+    Raises:
+        ScenarioError: `kind` is neither "paper" nor "devices".
+    """
+    width, depth = scenario.area.width_m, scenario.area.depth_m
+    count, oldest = scenario.traffic.devices, scenario.traffic.max_age_s
+    if kind == "paper":
+        high = np.array([width, depth, *[oldest] * count, _LARGEST], dtype=np.float32)
+        return spaces.Box(np.zeros_like(high), high, dtype=np.float32)
+    if kind == "devices":
+        uav = np.array([width, depth, _LARGEST, 1.0], dtype=np.float32)
+        assert len(uav) == len(UAV_ENTRIES)
+        packet = max(scenario.traffic.packet_bits_each) / 1e6
+        high = np.array([width, depth, oldest, count, packet, 1.0], dtype=np.float32)
+        low = np.array([-width, -depth, 0.0, 0.0, 0.0, 0.0], dtype=np.float32)
+        shape = (count, len(DEVICE_ENTRIES))
+        return spaces.Dict(
+            uav=spaces.Box(np.zeros_like(uav), uav, dtype=np.float32),
+            devices=spaces.Box(np.broadcast_to(low, shape), np.broadcast_to(high, shape), dtype=np.float32),
+        )
+    raise ScenarioError(f"observation = {kind!r}, allowed: 'paper', 'devices'")
+
+
+def action_space(scenario: Scenario) -> spaces.Dict:
+    """Dict(displacement_m: Box(-d_max, d_max, (2,)), device: Discrete(K + 1)), device 0 being idle."""
+    reach = scenario.airframe.max_displacement_m
+    return spaces.Dict(
+        displacement_m=spaces.Box(-reach, reach, (2,), dtype=np.float32),
+        device=spaces.Discrete(scenario.traffic.devices + 1),
+    )
+
+
+def outcome_info(state: SimState, outcome: Outcome, layout_m: Float) -> dict[str, Any]:
+    """The `info` of a step, batched: every field of the outcome, ages, positions and clocks."""
+    info = {name: getattr(outcome, name) for name in outcome.__dataclass_fields__}
+    info |= {"age_s": state.age_s, "position_m": state.position_m, "layout_m": layout_m}
+    return info | {"time_s": state.time_s, "step": state.step, "step_s": outcome.duration_s}
+
+
+class DataCollectionVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
+    """N environments advanced at once, from one generator; a finished one is reset by the next step.
+
+    Args:
+        num_envs: N.
+        scenario: preset name, TOML file or Scenario.
+        layout: (K, 2) or (N, K, 2) device positions (m); None draws a new layout at each reset.
+        observation: "paper" (positions of devices unseen) or "devices".
+        overrides: any scenario field, such as `fading="none"`.
+    """
+
+    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012  # Gymnasium's own form
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scenario: str | Scenario = "released",
+        layout: ArrayLike | None = None,
+        observation: ObservationKind = "paper",
+        render_mode: None = None,
+        **overrides: Any,
+    ) -> None:
+        if num_envs < 1:
+            raise ScenarioError(f"num_envs = {num_envs}, allowed: 1 or more")
+        if render_mode is not None:
+            raise ScenarioError(f"render_mode = {render_mode!r}: the vector environment has none, use the single one")
+        self.scenario = load_scenario(scenario, **overrides)
+        self.num_envs = num_envs
+        self.render_mode = render_mode
+        self.kind = observation
+        self._fixed_layout = None if layout is None else self._layouts(layout)
+        self.single_observation_space = observation_space(observation, self.scenario)
+        self.single_action_space = action_space(self.scenario)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.layout_m = np.zeros((num_envs, self.scenario.traffic.devices, 2))
+        self.state = initial_state(np.zeros((num_envs, 2)), self.scenario.traffic.devices)
+        self._done = np.zeros(num_envs, dtype=bool)
+
+    def _layouts(self, layout: ArrayLike) -> Float:
+        array = np.asarray(layout, dtype=np.float64)
+        if array.ndim == 3:
+            if len(array) != self.num_envs:
+                raise ScenarioError(f"layout has shape {array.shape}, allowed: (K, 2) or ({self.num_envs}, K, 2)")
+            return np.stack([check_layout(one, self.scenario) for one in array])
+        one = check_layout(layout, self.scenario)
+        return np.broadcast_to(one, (self.num_envs, *one.shape)).copy()
+
+    def _restart(self, mask: NDArray[np.bool_], options: dict[str, Any] | None) -> None:
+        """Reset the environments of `mask`; draws for all of them, so that streams do not depend on the mask."""
+        options = options or {}
+        unknown = set(options) - {"position_m", "layout"}
+        if unknown:
+            raise ScenarioError(f"reset option {sorted(unknown)[0]!r} does not exist, allowed: 'position_m', 'layout'")
+        count, devices = self.num_envs, self.scenario.traffic.devices
+        layout = random_positions(self.np_random, (count, devices, 2), self.scenario)
+        position = random_positions(self.np_random, (count, 2), self.scenario)
+        if options.get("layout") is not None:
+            layout = self._layouts(options["layout"])
+        elif self._fixed_layout is not None:
+            layout = self._fixed_layout
+        if options.get("position_m") is not None:
+            wanted = np.asarray(options["position_m"])
+            shape = (count, 2) if wanted.ndim > 1 else (2,)
+            position = np.broadcast_to(_check_positions(wanted, shape, "position_m", self.scenario), (count, 2))
+        fresh = initial_state(position, devices)
+        row = mask[:, None]
+        self.layout_m = np.where(row[:, :, None], layout, self.layout_m)
+        self.state = SimState(
+            **{
+                name: np.where(row if getattr(fresh, name).ndim == 2 else mask, getattr(fresh, name), value)
+                for name, value in vars(self.state).items()
+            }
+        )
+        self._done = self._done & ~mask
+
+    def reset(self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Start N episodes. `options`: position_m (2,) or (N, 2), layout (K, 2) or (N, K, 2)."""
+        if isinstance(seed, list):
+            raise ScenarioError("seed is a list, allowed: one integer (the vector environment has one generator)")
+        super().reset(seed=seed)
+        self._restart(np.ones(self.num_envs, dtype=bool), options)
+        info = {"age_s": self.state.age_s, "position_m": self.state.position_m, "layout_m": self.layout_m}
+        return observe(self.kind, self.scenario, self.layout_m, self.state), info
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        """Advance N environments; those that ended in the step before are reset instead (reward 0)."""
+        action = FlightAction(
+            np.asarray(actions["displacement_m"], dtype=np.float64), np.asarray(actions["device"], dtype=np.int64)
+        )
+        before = self._done
+        state, outcome = advance(self.scenario, self.layout_m, self.state, action, draw(self.np_random, self.num_envs))
+        self.state = state
+        reward, terminated, truncated = outcome.reward, outcome.terminated, outcome.truncated
+        info = outcome_info(state, outcome, self.layout_m)
+        if before.any():
+            self._restart(before, None)
+            reward = np.where(before, 0.0, reward)
+            terminated, truncated = terminated & ~before, truncated & ~before
+            info |= {"age_s": self.state.age_s, "position_m": self.state.position_m, "layout_m": self.layout_m}
+            info |= {"time_s": self.state.time_s, "step": self.state.step}
+        self._done = terminated | truncated
+        observation = observe(self.kind, self.scenario, self.layout_m, self.state)
+        return observation, reward, terminated, truncated, info
+
+
+class DataCollectionEnv(gymnasium.Env[Any, Any]):
+    """One environment; arguments as `DataCollectionVectorEnv`. `render_mode="rgb_array"` draws the map.
+
+    `info` holds, as floats and (K,) or (2,) arrays: age_s, rate_bps, snr, transmission_s, move_s, step_s, energy_j and
+    its parts, device_energy_j, served, outage, and what else `Outcome` says.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012  # Gymnasium's own form
+
+    def __init__(
+        self,
+        scenario: str | Scenario = "released",
+        layout: ArrayLike | None = None,
+        observation: ObservationKind = "paper",
+        render_mode: str | None = None,
+        **overrides: Any,
+    ) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise ScenarioError(f"render_mode = {render_mode!r}, allowed: none, 'rgb_array'")
+        self._one = DataCollectionVectorEnv(1, scenario, layout, observation, **overrides)
+        self.scenario = self._one.scenario
+        self.render_mode = render_mode
+        self.observation_space = self._one.single_observation_space
+        self.action_space = self._one.single_action_space
+        self._path_m: list[Float] = []
+        self._served = 0
+
+    @property
+    def state(self) -> SimState:
+        """The simulator's state, N = 1."""
+        return self._one.state
+
+    @property
+    def layout_m(self) -> Float:
+        """Device positions (1, K, 2) (m)."""
+        return self._one.layout_m
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start an episode. `options`: position_m (2,), layout (K, 2)."""
+        super().reset(seed=seed)
+        self._one.np_random = self.np_random  # one generator, so that equal seeds mean equal draws
+        observation, info = self._one.reset(options=options)
+        self._path_m, self._served = [self.state.position_m[0]], 0
+        return _first(observation), _first(info)
+
+    def step(self, action: dict[str, Any]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Fly and serve once."""
+        wanted = np.asarray(action["displacement_m"], dtype=np.float64)
+        device = int(action["device"])
+        if wanted.shape != (2,) or not np.isfinite(wanted).all():
+            raise ScenarioError(f"displacement_m = {wanted.tolist()}, allowed: two finite numbers in metres")
+        if not 0 <= device <= self.scenario.traffic.devices:
+            raise ScenarioError(f"device = {device}, allowed: 0 (idle) to {self.scenario.traffic.devices}")
+        self._one._done[:] = False  # only a reset starts a new episode here
+        observation, reward, terminated, truncated, info = self._one.step(
+            {"displacement_m": wanted[None], "device": np.array([device])}
+        )
+        self._path_m.append(self.state.position_m[0])
+        self._served = device
+        return _first(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), _first(info)
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]  # Gymnasium leaves the frame's type open
+        """The map with devices coloured by age, the trajectory and the served link, (H, W, 3)."""
+        if self.render_mode is None:
+            return None
+        from uavrl.simulation.rendering import draw_frame  # here: matplotlib is slow to import
+
+        return draw_frame(self.scenario, self.layout_m[0], np.array(self._path_m), self.state.age_s[0], self._served)
+
+
+def _first(batch: Any) -> Any:
+    """Row 0 of a batched observation or info; numbers become Python's own."""
+    if isinstance(batch, dict):
+        return {key: _first(value) for key, value in batch.items()}
+    row = batch[0]
+    return row if row.ndim else row.item()
