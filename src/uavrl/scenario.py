@@ -252,9 +252,8 @@ def describe_validation(error: ValidationError, what: str) -> str:
     """The first problem of a pydantic error as one line: field, value, what is allowed."""
     first = error.errors(include_url=False)[0]
     # a union reports its branches in the location: keep the names that a user wrote
-    field = ".".join(
-        str(part) for part in first["loc"] if not (isinstance(part, str) and ("[" in part or part in _KINDS))
-    )
+    parts = [str(part) for part in first["loc"]]
+    field = ".".join(part for part in parts if "[" not in part and part not in _KINDS)
     message = first["msg"].removeprefix("Value error, ")
     if first["type"] == "extra_forbidden":
         return f"{what} field '{field}' does not exist"

@@ -42,7 +42,7 @@ def _fly(position_m: Array, displacement_m: Array, d_max: float, area: Area) -> 
 def _transmit(
     scenario: Scenario, layout_m: Array, position_m: Array, device: Array, draws: Draws
 ) -> tuple[Array, Array, Array]:
-    """(snr, rate in bit/s, packet in bits) of the link to `device` - 1, each (N,); an idle row's values mean nothing."""
+    """(snr, rate in bit/s, packet in bits) of the wanted link, each (N,); an idle row's values mean nothing."""
     xp = array_namespace(position_m)
     index = xp.clip(device - 1, 0, None)
     where = xp.take_along_axis(layout_m, xp.broadcast_to(index[:, None, None], (index.shape[0], 1, 2)), axis=1)[:, 0]

@@ -16,7 +16,6 @@ from uavrl.scenario import Scenario, load_scenario
 from uavrl.simulation.dynamics import advance, initial_state
 from uavrl.simulation.observations import (
     DEVICE_ENTRIES,
-    UAV_ENTRIES,
     ObservationKind,
     devices_observation,
     paper_observation,
@@ -55,7 +54,8 @@ def _check_positions(values: ArrayLike, shape: tuple[int, ...], what: str, scena
 
 def random_positions(generator: np.random.Generator, shape: tuple[int, ...], scenario: Scenario) -> Float:
     """Uniform positions in the area, `shape` ending in 2 (m)."""
-    return generator.random(shape) * np.array([scenario.area.width_m, scenario.area.depth_m])
+    positions: Float = generator.random(shape) * np.array([scenario.area.width_m, scenario.area.depth_m])
+    return positions
 
 
 def draw(generator: np.random.Generator, count: int) -> Draws:
@@ -84,7 +84,6 @@ def observation_space(kind: ObservationKind, scenario: Scenario) -> spaces.Space
         return spaces.Box(np.zeros_like(high), high, dtype=np.float32)
     if kind == "devices":
         uav = np.array([width, depth, _LARGEST, 1.0], dtype=np.float32)
-        assert len(uav) == len(UAV_ENTRIES)
         packet = max(scenario.traffic.packet_bits_each) / 1e6
         high = np.array([width, depth, oldest, count, packet, 1.0], dtype=np.float32)
         low = np.array([-width, -depth, 0.0, 0.0, 0.0, 0.0], dtype=np.float32)
@@ -279,13 +278,16 @@ class DataCollectionEnv(gymnasium.Env[Any, Any]):
         self._served = device
         return _first(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), _first(info)
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]  # Gymnasium leaves the frame's type open
+    def render(self) -> NDArray[np.uint8] | None:
         """The map with devices coloured by age, the trajectory and the served link, (H, W, 3)."""
         if self.render_mode is None:
             return None
         from uavrl.simulation.rendering import draw_frame  # here: matplotlib is slow to import
 
-        return draw_frame(self.scenario, self.layout_m[0], np.array(self._path_m), self.state.age_s[0], self._served)
+        frame: NDArray[np.uint8] = draw_frame(
+            self.scenario, self.layout_m[0], np.array(self._path_m), self.state.age_s[0], self._served
+        )
+        return frame
 
 
 def _first(batch: Any) -> Any:
@@ -293,4 +295,4 @@ def _first(batch: Any) -> Any:
     if isinstance(batch, dict):
         return {key: _first(value) for key, value in batch.items()}
     row = batch[0]
-    return row if row.ndim else row.item()
+    return row.copy() if row.ndim else row.item()
