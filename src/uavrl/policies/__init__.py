@@ -1,0 +1,1 @@
+"""What needs no learning: heuristics and the rollout planner."""
