@@ -1,0 +1,132 @@
+"""The command line. Each command is a frozen dataclass in a file of its own, parsed by tyro; its `run` does the work.
+
+A new command is one more line in `COMMANDS`. Only the command that was typed is imported, so the others cost nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import os
+import re
+import sys
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from uavrl import __version__
+from uavrl.errors import ConfigError, UavrlError
+
+
+class Command(NamedTuple):
+    """Where a command's dataclass is, and what `uavrl --help` says of it."""
+
+    target: str  # module:Class
+    summary: str
+
+
+COMMANDS: dict[str, Command] = {
+    "scenario show": Command("uavrl.cli.scenario:ScenarioShow", "print a scenario as TOML, every field explained"),
+    "scenario diff": Command("uavrl.cli.scenario:ScenarioDiff", "list the fields in which two scenarios differ"),
+    "scenario check": Command("uavrl.cli.scenario:ScenarioCheck", "validate a scenario file"),
+    "data show": Command("uavrl.cli.data:DataShow", "report behaviour and coverage of logged flights"),
+    "data select": Command("uavrl.cli.data:DataSelect", "select logged flights by size, quality and seed"),
+    "collect": Command("uavrl.cli.collect:Collect", "log the flights of an agent that learns online"),
+    "train": Command("uavrl.cli.train:Train", "learn a policy from logged flights alone"),
+    "evaluate": Command("uavrl.cli.evaluate:Evaluate", "fly policies on equal layouts, starts and fading"),
+    "demo": Command("uavrl.cli.demo:Demo", "learn a small policy, judge it, and show it"),
+    "watch": Command("uavrl.cli.watch:Watch", "make a web page of one flight of a policy"),
+}
+
+_BOX = re.compile(r"\x1b\[[0-9;]*m|[\u2500-\u257f]")  # colours, and the frame that tyro draws around its errors
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command and return the process's exit code: 0, 2 for a user's error, 130 interrupted, 141 pipe closed."""
+    try:
+        _dispatch(list(sys.argv[1:] if argv is None else argv))
+        sys.stdout.flush()
+    except UavrlError as error:
+        print(f"uavrl: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("uavrl: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter's last flush fails too
+        return 141
+    return 0
+
+
+def _dispatch(words: list[str]) -> None:
+    """Find the command that `words` begins with, parse the rest and run it."""
+    if not words or words[0] in ("-h", "--help"):
+        print(_usage(COMMANDS))
+        return
+    if words[0] == "--version":
+        print(f"uavrl {__version__}")
+        return
+    for length in (1, 2):
+        name = " ".join(words[:length])
+        if name in COMMANDS:
+            command = parse(name, words[length:])
+            if command is not None:
+                command.run()
+            return
+    group = {name: command for name, command in COMMANDS.items() if name.split()[0] == words[0]}
+    if group and len(words) == 2 and words[1] in ("-h", "--help"):
+        print(_usage(group))
+        return
+    if not group:
+        raise ConfigError(f"command '{words[0]}' does not exist, allowed: {', '.join(_first_words())}, --version")
+    allowed = ", ".join(name.split()[1] for name in group)
+    if len(words) == 1:
+        raise ConfigError(f"command '{words[0]}' needs one of: {allowed}")
+    raise ConfigError(f"command '{words[0]} {words[1]}' does not exist, allowed: {allowed}")
+
+
+def parse(name: str, words: Sequence[str]) -> Any:
+    """The command's dataclass, filled from the words after its name; None where they asked for help only.
+
+    Raises:
+        ConfigError: an unknown option, a missing one, or a value that is not allowed.
+    """
+    import tyro  # here: `uavrl --version` does without it
+
+    module, _, attribute = COMMANDS[name].target.partition(":")
+    kind = getattr(importlib.import_module(module), attribute)
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            return tyro.cli(kind, prog=f"uavrl {name}", args=words, config=(tyro.conf.FlagCreatePairsOff,))
+    except SystemExit as stop:
+        if stop.code in (0, None):
+            return None
+        raise ConfigError(f"{_condense(complaint.getvalue())} (see: uavrl {name} --help)") from None
+
+
+def _condense(box: str) -> str:
+    """One line from the framed text with which tyro refuses its arguments: what comes before the help."""
+    lines = []
+    for raw in box.splitlines():
+        line = " ".join(_BOX.sub("", raw).split())
+        if not line and lines and "\u2500" in raw:
+            break  # a rule or the frame's end: what follows repeats the help
+        if line:
+            lines.append(line)
+    if len(lines) > 1 and lines[1].startswith(lines[0]):
+        del lines[0]  # some titles repeat the message
+    title, *rest = lines or ["wrong arguments"]
+    return f"{title}: {' '.join(rest)}".rstrip(": .") if rest else title
+
+
+def _usage(commands: dict[str, Command]) -> str:
+    width = max(len(name) for name in commands)
+    rows = "\n".join(f"  {name:<{width}}  {command.summary}" for name, command in commands.items())
+    return (
+        f"usage: uavrl COMMAND [options]\n\n{rows}\n\nuavrl COMMAND --help lists a command's options; uavrl --version"
+    )
+
+
+def _first_words() -> list[str]:
+    return list(dict.fromkeys(name.split()[0] for name in COMMANDS))
