@@ -6,9 +6,10 @@ Every field name is unique across sections, so `Scenario.replace(fading="none")`
 
 from __future__ import annotations
 
+import difflib
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -19,7 +20,7 @@ from uavrl.errors import ScenarioError
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class _Section(BaseModel):
@@ -39,10 +40,10 @@ class Area(_Section):
 class Traffic(_Section):
     """The devices and what they send."""
 
-    devices: int = Field(10, ge=1, le=10_000, description="K, number of devices")
+    devices: int = Field(10, ge=1, le=10_000, description="K, devices (count)")
     packet_bits: Positive | tuple[Positive, ...] = Field(2e6, description="D_k (bit), one value or one a device")
-    priority: tuple[Annotated[float, Field(ge=0, le=1)], ...] | None = Field(
-        None, description="delta_k, one a device in [0, 1]; none: 1/K each"
+    priority: tuple[Share, ...] | None = Field(
+        None, description="delta_k, one a device in [0, 1] (weight); none: 1/K each"
     )
     max_age_s: Positive = Field(400.0, description="A_max, upper limit of the age of information (s)")
 
@@ -73,27 +74,28 @@ class Channel(_Section):
 
     altitude_m: Positive = Field(100.0, description="h, height of flight (m)")
     line_of_sight: Literal["paper", "al_hourani"] = Field(
-        "paper", description="eq. (LoS_Prob) with los_c, los_d; or Al-Hourani 2014 with its environment"
+        "paper", description="eq. (LoS_Prob) with los_c and los_d; or Al-Hourani 2014 with its environment"
     )
     environment: Literal["suburban", "urban", "dense_urban", "high_rise"] = Field(
-        "urban", description="environment of al_hourani; sets its sigmoid and both excess losses"
+        "urban",
+        description="of al_hourani alone: sets the sigmoid and both excess losses, in place of los_c to excess_nlos_db",
     )
-    los_c: Positive = Field(10.0, description="C of eq. (LoS_Prob), degrees")
-    los_d: Positive = Field(0.6, description="D of eq. (LoS_Prob), 1/degree")
+    los_c: Positive = Field(10.0, description="C of eq. (LoS_Prob) (degree)")
+    los_d: Positive = Field(0.6, description="D of eq. (LoS_Prob) (1/degree)")
     excess_los_db: NonNegative = Field(1.0, description="xi_LoS (dB)")
     excess_nlos_db: NonNegative = Field(20.0, description="xi_NLoS (dB)")
     carrier_hz: Positive = Field(2e9, description="f_c (Hz)")
     light_speed_mps: Positive = Field(3e8, description="v_l (m/s)")
     bandwidth_hz: Positive = Field(1e6, description="B (Hz)")
-    noise_dbm_per_hz: Finite = Field(-174.0, description="N_0 (dBm/Hz)")
+    noise_dbm_per_hz: float = Field(-174.0, ge=-250, le=0, description="N_0 (dBm/Hz)")
     transmit_power_w: Positive = Field(0.1259, description="P of a device (W); not in the paper, from its code")
     fading: Literal["none", "rayleigh", "rician", "ergodic"] = Field(
         "rayleigh",
         description="small-scale fading, drawn once a packet; rician: Rician in line of sight, else Rayleigh; "
         "ergodic: the rate is its mean over Rayleigh fading",
     )
-    rician_min_db: Finite = Field(5.0, description="Rician factor at elevation 0 (dB)")
-    rician_max_db: Finite = Field(15.0, description="Rician factor overhead (dB)")
+    rician_min_db: float = Field(5.0, ge=-100, le=100, description="Rician factor at elevation 0 (dB)")
+    rician_max_db: float = Field(15.0, ge=-100, le=100, description="Rician factor overhead (dB)")
     max_transmission_s: Positive | None = Field(
         None, description="a packet that would take longer is lost after this time (s): an outage"
     )
@@ -119,7 +121,7 @@ class Airframe(_Section):
     mass_kg: Positive = Field(0.5, description="m_tot (kg)")
     gravity_mps2: Positive = Field(9.807, description="g (m/s^2)")
     propeller_radius_m: Positive = Field(0.2, description="r_p (m)")
-    propellers: int = Field(4, ge=1, description="n_p")
+    propellers: int = Field(4, ge=1, description="n_p, propellers (count)")
     air_density_kgpm3: Positive = Field(1.225, description="rho (kg/m^3)")
     max_power_w: NonNegative = Field(5.0, description="P_max, extra power at v_max (W)")
     idle_power_w: NonNegative = Field(0.0, description="P_idle (W)")
@@ -128,12 +130,13 @@ class Airframe(_Section):
     induced_power_w: NonNegative = Field(88.63, description="Pi of Zeng 2019, induced power (W)")
     tip_speed_mps: Positive = Field(120.0, description="U of Zeng 2019 (m/s)")
     induced_speed_mps: Positive = Field(4.03, description="v0 of Zeng 2019 (m/s)")
-    drag_ratio: NonNegative = Field(0.6, description="d0 of Zeng 2019")
-    solidity: NonNegative = Field(0.05, description="s of Zeng 2019")
+    drag_ratio: NonNegative = Field(0.6, description="d0 of Zeng 2019, fuselage drag (ratio)")
+    solidity: NonNegative = Field(0.05, description="s of Zeng 2019, rotor solidity (ratio)")
     disc_area_m2: Positive = Field(0.503, description="A of Zeng 2019 (m^2)")
     decision_s: NonNegative = Field(0.02, description="T_exec, time of a decision (s)")
     decision_time: Literal["fixed", "measured"] = Field(
-        "fixed", description="T_exec is decision_s, or the policy's own measured latency"
+        "fixed",
+        description="T_exec is decision_s; or the policy's own latency, where the caller of the simulator measures it",
     )
     charge_idle_hover: bool = Field(
         False, description="hovering without transmitting costs hover power; the paper charges nothing"
@@ -154,7 +157,7 @@ class Objective(_Section):
         "per_step",
         description="per_step: ages after the step; per_second: age integrated over the step, discount gamma^seconds",
     )
-    age_weight: float = Field(0.5, ge=0, le=1, description="lambda, weight of age against energy")
+    age_weight: Share = Field(0.5, description="lambda, share of age against energy (ratio)")
     age_reference_s: Positive = Field(1.0, description="age is divided by this (s)")
     energy_reference_j: Positive | None = Field(
         1000.0, description="energy is divided by this (J); none: hover power x 1 s"
@@ -164,7 +167,7 @@ class Objective(_Section):
 class Limits(_Section):
     """When an episode ends. Steps and time truncate it; a drained battery terminates it."""
 
-    max_steps: int | None = Field(400, ge=1, description="truncated at this many steps")
+    max_steps: int | None = Field(400, ge=1, description="truncated at this many steps (count)")
     time_budget_s: Positive | None = Field(400.0, description="truncated once more than this has elapsed (s)")
     energy_budget_j: Positive | None = Field(None, description="battery; terminated once more has been used (J)")
 
@@ -178,7 +181,7 @@ class Limits(_Section):
 class Scenario(_Section):
     """A whole scenario. Frozen; make another with `replace`."""
 
-    name: str = "custom"
+    name: str = Field("custom", description="what tables call it")
     area: Area = Area()
     traffic: Traffic = Traffic()
     channel: Channel = Channel()
@@ -197,15 +200,18 @@ class Scenario(_Section):
             if key == "name":
                 data["name"] = value
             elif key in _SECTIONS:
-                data[key] = {**data[key], **(value.model_dump() if isinstance(value, BaseModel) else dict(value))}
+                section = value.model_dump() if isinstance(value, BaseModel) else value
+                if not isinstance(section, Mapping):
+                    raise ScenarioError(f"scenario section '{key}' = {value!r}: must be fields with their values")
+                data[key] = {**data[key], **section}
             elif key in _SECTION_OF:
                 data[_SECTION_OF[key]][key] = value
             else:
-                raise ScenarioError(f"scenario field '{key}' does not exist, allowed: {', '.join(_SECTION_OF)}")
+                raise ScenarioError(f"scenario field '{key}' does not exist{_nearest(key, _SECTION_OF)}")
         return parse_scenario(data)
 
     def to_toml(self) -> str:
-        """TOML text that `load_scenario` reads back to an equal scenario; a field that is none is left out."""
+        """TOML text that `load_scenario` reads back to an equal scenario; None becomes the word "none"."""
         data = self.model_dump(mode="json")
         return tomli_w.dumps(
             {
@@ -245,18 +251,26 @@ def parse_scenario(data: Mapping[str, Any]) -> Scenario:
     try:
         return Scenario.model_validate(cleaned)
     except ValidationError as error:
-        raise ScenarioError(describe_validation(error, "scenario")) from None
+        raise ScenarioError(describe_validation(error, "scenario", known=(*_SECTION_OF, *_SECTIONS))) from None
 
 
-def describe_validation(error: ValidationError, what: str) -> str:
-    """The first problem of a pydantic error as one line: field, value, what is allowed."""
-    first = error.errors(include_url=False)[0]
-    # a union reports its branches in the location: keep the names that a user wrote
+def describe_validation(error: ValidationError, what: str, known: Iterable[str] = ()) -> str:
+    """The first problem of a pydantic error as one line: field, value, what is allowed.
+
+    Args:
+        error: what pydantic raised.
+        what: opens the line, such as "scenario".
+        known: names from which to propose one where a field does not exist.
+    """
+    problems = error.errors(include_url=False)
+    # a union reports each of its branches: the one that got furthest is the one that was meant
+    first = max((p for p in problems if p["loc"][:2] == problems[0]["loc"][:2]), key=lambda p: len(p["loc"]))
+    # and names them in the location: keep the names that a user wrote
     parts = [str(part) for part in first["loc"]]
     field = ".".join(part for part in parts if "[" not in part and part not in _KINDS)
     message = first["msg"].removeprefix("Value error, ")
     if first["type"] == "extra_forbidden":
-        return f"{what} field '{field}' does not exist"
+        return f"{what} field '{field}' does not exist{_nearest(parts[-1], known)}"
     if first["type"] == "value_error":
         return f"{what} section '{field}': {message}" if field else f"{what}: {message}"
     if first["type"] == "missing":
@@ -264,7 +278,13 @@ def describe_validation(error: ValidationError, what: str) -> str:
     return f"{what} field '{field}' = {first['input']!r}: {message[0].lower()}{message[1:]}"
 
 
-_KINDS = {"float", "int", "str", "bool"}
+_KINDS = {"float", "int", "str", "bool", "constrained-float", "constrained-int"}
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    near = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
+    return f", nearest: {', '.join(near)}" if near else ""
+
 
 PRESETS: dict[str, Scenario] = {
     # eq. (reward) as printed: both terms over T = 400, delta_k = 1/K inside the sum
