@@ -1,0 +1,32 @@
+"""Denoising diffusion: noise schedules, samplers and the denoising loss, for any denoiser."""
+
+from uavrl.diffusion.samplers import (
+    Denoiser,
+    Variance,
+    add_noise,
+    ddim,
+    ddpm,
+    denoising_loss,
+    dpm_solver_pp_2m,
+    one_step,
+    predict_x0,
+    straight_through_clamp,
+)
+from uavrl.diffusion.schedules import Schedule, ScheduleName, make_schedule, schedule_from_beta
+
+__all__ = [
+    "Denoiser",
+    "Schedule",
+    "ScheduleName",
+    "Variance",
+    "add_noise",
+    "ddim",
+    "ddpm",
+    "denoising_loss",
+    "dpm_solver_pp_2m",
+    "make_schedule",
+    "one_step",
+    "predict_x0",
+    "schedule_from_beta",
+    "straight_through_clamp",
+]
