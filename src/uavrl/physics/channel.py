@@ -120,3 +120,91 @@ def link_snr(horizontal_m: Array, channel: Channel) -> tuple[Array, Array, Array
     elevation = elevation_deg(distance, channel.altitude_m)
     los = line_of_sight_probability(elevation, channel)
     return elevation, los, mean_snr(mean_path_loss_db(distance, los, channel), channel)
+
+
+# Nodes and weights of integrals over |h|^2 in u = ln |h|^2, and of the phase: errors under 1e-9 up to _LARGEST_FACTOR.
+_LOG_POWER = np.linspace(-20.0, 4.2, 256)
+_POWER_NODES = np.exp(_LOG_POWER)
+_POWER_WEIGHTS = (_LOG_POWER[1] - _LOG_POWER[0]) * _POWER_NODES
+_PHASE_COSINES = np.cos((np.arange(64) + 0.5) * (np.pi / 64))
+_LARGEST_FACTOR = 100.0  # above 20 dB the power hardly fades, and narrower densities would need more nodes
+
+
+def fading_density(power: Array, factor: Array) -> Array:
+    """Density of `fading_power` at |h|^2 = `power`, by integrating the complex Gaussian h over its phase.
+
+    With m = sqrt(K/(K+1)) it is the mean over theta of (K+1) exp(-(K+1) |sqrt(power) e^(j theta) - m|^2); K = 0 gives
+    Rayleigh's exp(-power). Factors above 100 count as 100.
+
+    Args:
+        power: (...) at least 0.
+        factor: (...) Rician factor K (ratio), of a shape that broadcasts.
+    """
+    xp = array_namespace(power)
+    factor = xp.clip(factor, 0.0, _LARGEST_FACTOR)[..., None]
+    root = xp.sqrt(power)[..., None]
+    cosine = xp.asarray(_PHASE_COSINES, dtype=power.dtype, device=power.device)
+    line = xp.sqrt(factor / (factor + 1.0))
+    square = (root - line) ** 2 + 2.0 * root * line * (1.0 - cosine)
+    return xp.mean((factor + 1.0) * xp.exp(-(factor + 1.0) * square), axis=-1)
+
+
+def _power_quadrature(least: Array, factor: Array) -> tuple[Array, Array]:
+    """Nodes |h|^2 > least and their weights (..., nodes): sum(weights f(nodes)) = E[f(|h|^2); |h|^2 > least]."""
+    xp = array_namespace(least)
+    nodes = xp.asarray(_POWER_NODES, dtype=least.dtype, device=least.device)
+    weights = xp.asarray(_POWER_WEIGHTS, dtype=least.dtype, device=least.device)
+    power = least[..., None] + nodes
+    return power, fading_density(power, factor[..., None]) * weights
+
+
+def _limited_service(unit_s: Array, snr: Array, factor: Array, limit_s: float) -> tuple[Array, Array]:
+    """(E[min(T_com, limit)], P(T_com <= limit)) over one kind of fading; `unit_s` is T_com at 1 bit/s/Hz."""
+    xp = array_namespace(snr)
+    exponent = xp.clip(unit_s * (math.log(2.0) / limit_s), 0.0, 80.0)  # beyond it nothing arrives; exp would overflow
+    power, weights = _power_quadrature(xp.expm1(exponent) / snr, factor)
+    arrival = xp.clip(xp.sum(weights, axis=-1), 0.0, 1.0)
+    seconds = unit_s[..., None] * math.log(2.0) / xp.log1p(snr[..., None] * power)
+    return xp.sum(weights * seconds, axis=-1) + (1.0 - arrival) * limit_s, arrival
+
+
+def _mean_rate_bps(snr: Array, los: Array, factor: Array, channel: Channel) -> Array:
+    """Mean of eq. (rate) over the channel's fading (bit/s)."""
+    xp = array_namespace(snr)
+    if channel.fading == "none":
+        return rate_bps(snr, channel.bandwidth_hz)
+    rate = ergodic_rate_bps(snr, channel.bandwidth_hz)
+    if channel.fading == "rician":
+        power, weights = _power_quadrature(xp.zeros_like(snr), factor)
+        in_sight = xp.sum(weights * rate_bps(snr[..., None] * power, channel.bandwidth_hz), axis=-1)
+        rate = los * in_sight + (1.0 - los) * rate
+    return rate
+
+
+def expected_service(horizontal_m: Array, packet_bits: Array, channel: Channel) -> tuple[Array, Array]:
+    """How long one attempt to send a packet takes on average, and how likely the packet arrives.
+
+    With an outage limit: E[min(T_com, limit)] and P(T_com <= limit) over the fading. Without one, Rayleigh and Rician
+    fading make the mean of T_com infinite (1/log2(1 + gamma X) diverges at X -> 0), so T_com at the mean rate stands
+    for it, with probability 1.
+
+    Args:
+        horizontal_m: (...) horizontal distance d (m).
+        packet_bits: (...) D_k (bit), of the same shape.
+
+    Returns:
+        Seconds and probability, each (...).
+    """
+    xp = array_namespace(horizontal_m)
+    elevation, los, snr = link_snr(horizontal_m, channel)
+    factor, limit_s = rician_factor(elevation, channel), channel.max_transmission_s
+    if limit_s is None or channel.fading in ("none", "ergodic"):
+        seconds = transmission_s(packet_bits, _mean_rate_bps(snr, los, factor, channel))
+        limit = math.inf if limit_s is None else limit_s
+        return xp.clip(seconds, 0.0, limit), xp.astype(seconds <= limit, seconds.dtype)
+    unit_s = packet_bits / channel.bandwidth_hz
+    seconds, arrival = _limited_service(unit_s, snr, xp.zeros_like(snr), limit_s)
+    if channel.fading == "rician":
+        in_sight_s, in_sight = _limited_service(unit_s, snr, factor, limit_s)
+        seconds, arrival = los * in_sight_s + (1.0 - los) * seconds, los * in_sight + (1.0 - los) * arrival
+    return seconds, arrival

@@ -38,6 +38,6 @@ class Policy(Protocol):
     def act(self, observation: Any, *, generator: np.random.Generator, deterministic: bool = False) -> FlightAction:
         """Displacements (N, 2) in metres and devices (N,), 0 being idle.
 
-        The caller ignores the rows of flights that have ended. Randomness comes from `generator` alone, and none is
-        used when `deterministic`.
+        The caller ignores the rows of flights that have ended. Randomness comes from `generator` alone;
+        `deterministic` asks for the most likely action of a policy that has one.
         """
