@@ -194,7 +194,15 @@ class DataCollectionVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         super().reset(seed=seed)
         self._restart(np.ones(self.num_envs, dtype=bool), options)
         info = {"age_s": self.state.age_s, "position_m": self.state.position_m, "layout_m": self.layout_m}
-        return observe(self.kind, self.scenario, self.layout_m, self.state), info
+        return self.observation(), info
+
+    def observation(self) -> Observation:
+        """What `reset` and `step` last returned as observation."""
+        return observe(self.kind, self.scenario, self.layout_m, self.state)
+
+    def restore(self, state: SimState, layout_m: Float, done: NDArray[np.bool_]) -> None:
+        """Go on from a saved state; `done` (N,) marks the environments that the next step resets."""
+        self.state, self.layout_m, self._done = state, layout_m, done
 
     def step(self, actions: dict[str, Any]) -> Any:
         """Advance N environments; those that ended in the step before are reset instead (reward 0)."""
@@ -213,8 +221,7 @@ class DataCollectionVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             info |= {"age_s": self.state.age_s, "position_m": self.state.position_m, "layout_m": self.layout_m}
             info |= {"time_s": self.state.time_s, "step": self.state.step}
         self._done = terminated | truncated
-        observation = observe(self.kind, self.scenario, self.layout_m, self.state)
-        return observation, reward, terminated, truncated, info
+        return self.observation(), reward, terminated, truncated, info
 
 
 class DataCollectionEnv(gymnasium.Env[Any, Any]):

@@ -1,0 +1,110 @@
+"""What every agent is: a frozen config, a bundle of networks and optimisers, `update` and `act`."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor, nn
+
+from uavrl.actions import HybridAction
+from uavrl.networks import NetworkConfig, Observation, Spaces
+
+Metrics = dict[str, Tensor]  # 0-d tensors, read only when they are logged: no host synchronisation in the loop
+
+
+@dataclass(frozen=True)
+class Batch:
+    """B transitions."""
+
+    observation: Observation  # (B, ...)
+    action: HybridAction  # executed: continuous (B, C) in [-1, 1], choice (B,) int64
+    reward: Tensor  # (B,) as the agent is to see it, see `RewardConfig`
+    duration_s: Tensor  # (B,)
+    terminated: Tensor  # (B,) float, 1 where no future follows; a truncation is 0 and bootstraps
+    next_observation: Observation  # (B, ...)
+
+
+class RewardConfig(BaseModel):
+    """From logged rewards to what the critic learns from."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    transform: Literal["none", "zscore", "centred"] = Field(
+        "centred",
+        description="zscore: eq. (rewards_norm); centred: minus the median, which puts Q near 0 from the start and "
+        "changes no optimum while episodes are only truncated",
+    )
+    clip: float | None = Field(6.0, gt=0, description="transformed rewards are held in [-clip, clip]")
+    scale: float = Field(1.0, gt=0, description="factor after the transform")
+
+
+class AgentConfig(BaseModel):
+    """What all agents share."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    network: NetworkConfig = NetworkConfig()
+    reward: RewardConfig = RewardConfig()
+    batch_size: int = Field(256, ge=1, description="transitions an update")
+    learning_rate: float = Field(3e-4, gt=0, description="of Adam")
+    discount: float = Field(0.99, ge=0, lt=1, description="gamma, per step or per second")
+    discount_per: Literal["step", "second"] = Field(
+        "step", description="per second: gamma^duration, the semi-Markov discount of a per-second objective"
+    )
+    polyak: float = Field(0.005, gt=0, le=1, description="target <- (1 - polyak) target + polyak network, each update")
+    gradient_clip: float | None = Field(10.0, gt=0, description="largest gradient norm of a network")
+
+
+class Agent(ABC):
+    """Networks and optimisers of one algorithm for declared spaces."""
+
+    config: AgentConfig
+    spaces: Spaces
+    networks: nn.ModuleDict  # everything that is saved, targets and averages included
+    optimisers: dict[str, torch.optim.Optimizer]
+
+    @abstractmethod
+    def update(self, batch: Batch, generator: torch.Generator) -> Metrics:
+        """One gradient step of every network; all noise comes from `generator`."""
+
+    @abstractmethod
+    def act(self, observation: Observation, *, generator: torch.Generator, deterministic: bool = False) -> HybridAction:
+        """Actions for B observations."""
+
+
+def discounts(batch: Batch, config: AgentConfig) -> Tensor:
+    """gamma (1 - terminated) of each transition, (B,); gamma^duration where discounting is per second."""
+    if config.discount_per == "second":
+        return torch.pow(config.discount, batch.duration_s) * (1.0 - batch.terminated)
+    return config.discount * (1.0 - batch.terminated)
+
+
+def minimise(
+    loss: Tensor, network: nn.Module | list[Tensor], optimiser: torch.optim.Optimizer, clip: float | None
+) -> Tensor:
+    """One optimiser step on `network` alone, whatever else `loss` depends on; returns the gradient's norm."""
+    parameters = list(network.parameters()) if isinstance(network, nn.Module) else network
+    gradients = torch.autograd.grad(loss, parameters)
+    for parameter, gradient in zip(parameters, gradients, strict=True):
+        parameter.grad = gradient
+    norm = torch.nn.utils.clip_grad_norm_(parameters, clip if clip is not None else float("inf"))
+    optimiser.step()
+    return norm
+
+
+@torch.no_grad()
+def move_towards(target: nn.Module, source: nn.Module, rate: float) -> None:
+    """Polyak averaging, target <- (1 - rate) target + rate source; buffers are copied."""
+    torch._foreach_lerp_(list(target.parameters()), list(source.parameters()), rate)
+    for mine, theirs in zip(target.buffers(), source.buffers(), strict=True):
+        mine.copy_(theirs)
+
+
+def adam(parameters: Iterable[Tensor], config: AgentConfig) -> torch.optim.Optimizer:
+    """The optimiser of every network, fused."""
+    return torch.optim.Adam(parameters, lr=config.learning_rate, fused=True)

@@ -1,0 +1,145 @@
+r"""Hybrid soft actor-critic, online: exact over the choice d, reparameterised over the displacement w.
+
+V(s) = E_w[ \sum_d \pi(d|s) ( \min_j Q_j(s, w, d) - a_d \log \pi(d|s) ) - a_c \log \pi(w|s) ]
+
+Haarnoja et al. 2018 with the hybrid action of Delalleau et al. 2019 (arXiv:1912.11077): two temperatures, one for each
+part, because their entropies have different units.
+"""
+
+from __future__ import annotations
+
+import math
+from copy import deepcopy
+from typing import Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+from torch.nn import functional
+
+from uavrl.actions import HybridAction
+from uavrl.agents.base import (
+    Agent,
+    AgentConfig,
+    Batch,
+    Metrics,
+    RewardConfig,
+    adam,
+    discounts,
+    minimise,
+    move_towards,
+)
+from uavrl.networks import Observation, Spaces, make_actor, make_critic
+from uavrl.networks.interfaces import ActorOutput
+
+
+class SacConfig(AgentConfig):
+    """Settings of hybrid SAC."""
+
+    name: Literal["sac"] = "sac"
+    reward: RewardConfig = RewardConfig(transform="none", clip=10.0)
+    continuous_entropy: float = Field(-2.0, description="target entropy of tanh w, H_c")
+    choice_entropy: float = Field(0.3, ge=0, lt=1, description="target entropy of d, as a share of log D")
+    initial_temperature: float = Field(0.1, gt=0, description="both temperatures at the start")
+
+
+class SquashedSample:
+    """w = tanh(u), u = mean + std noise, with its log density."""
+
+    def __init__(self, output: ActorOutput, noise: Tensor) -> None:
+        self.pre = output.mean + output.log_std.exp() * noise
+        self.continuous = torch.tanh(self.pre)  # (B, C)
+        normal = -0.5 * noise.square() - output.log_std - 0.5 * math.log(2.0 * math.pi)
+        # log(1 - tanh(u)^2) = 2 (log 2 - u - softplus(-2u)), which does not lose its digits at the edge
+        squash = 2.0 * (math.log(2.0) - self.pre - functional.softplus(-2.0 * self.pre))
+        self.log_density = (normal - squash).sum(dim=-1)  # (B,)
+
+
+def soft_value(q: Tensor, log_choice: Tensor, log_density: Tensor, a_c: Tensor, a_d: Tensor) -> Tensor:
+    """V of the module's docstring for one w a row: q and log_choice (B, D), log_density (B,) -> (B,)."""
+    return (log_choice.exp() * (q - a_d * log_choice)).sum(dim=-1) - a_c * log_density
+
+
+class Sac(Agent):
+    """Hybrid SAC for declared spaces."""
+
+    config: SacConfig
+
+    def __init__(self, spaces: Spaces, config: SacConfig) -> None:
+        self.spaces, self.config = spaces, config
+        self.actor = make_actor(spaces, config.network)
+        self.critic = make_critic(spaces, config.network)
+        self.target = deepcopy(self.critic).requires_grad_(False)
+        self.log_temperature = nn.Parameter(torch.full((2,), math.log(config.initial_temperature)))  # a_c, a_d
+        self.networks = nn.ModuleDict(
+            {
+                "actor": self.actor,
+                "critic": self.critic,
+                "target": self.target,
+                "temperature": nn.ParameterList([self.log_temperature]),
+            }
+        )
+        self.optimisers = {
+            "actor": adam(self.actor.parameters(), config),
+            "critic": adam(self.critic.parameters(), config),
+            "temperature": adam([self.log_temperature], config),
+        }
+
+    def critic_loss(self, batch: Batch, noise: Tensor) -> tuple[Tensor, Metrics]:
+        """Half the squared Bellman error of both Q functions, summed; noise (B, C)."""
+        with torch.no_grad():
+            output = self.actor(batch.next_observation)
+            sample = SquashedSample(output, noise)
+            q_next = self.target.all_choices(self.target.encode(batch.next_observation), sample.continuous).amin(dim=0)
+            a_c, a_d = self.log_temperature.exp()
+            value = soft_value(q_next, output.logits.log_softmax(dim=-1), sample.log_density, a_c, a_d)
+            target = batch.reward + discounts(batch, self.config) * value
+        choice = functional.one_hot(batch.action.choice, q_next.shape[-1]).to(target.dtype)
+        q = self.critic.value(self.critic.encode(batch.observation), batch.action.continuous, choice)
+        loss = 0.5 * (q - target).square().mean(dim=1).sum()
+        return loss, {"critic_loss": loss.detach(), "q": q.detach().mean()}
+
+    def actor_loss(self, batch: Batch, noise: Tensor) -> tuple[Tensor, Metrics]:
+        """-V(s) under the current critic; noise (B, C)."""
+        output = self.actor(batch.observation)
+        sample = SquashedSample(output, noise)
+        with torch.no_grad():
+            context = self.critic.encode(batch.observation)
+        q = self.critic.all_choices(context, sample.continuous).amin(dim=0)
+        log_choice = output.logits.log_softmax(dim=-1)
+        a_c, a_d = self.log_temperature.detach().exp()
+        loss = -soft_value(q, log_choice, sample.log_density, a_c, a_d).mean()
+        entropy = torch.stack([-sample.log_density.mean(), -(log_choice.exp() * log_choice).sum(dim=-1).mean()])
+        return loss, {"actor_loss": loss.detach(), "entropy": entropy.detach()}
+
+    def temperature_loss(self, entropy: Tensor, choices: int) -> Tensor:
+        """Raises a temperature whose entropy (2,) is under its target, lowers the other."""
+        wanted = torch.tensor(
+            [self.config.continuous_entropy, self.config.choice_entropy * math.log(choices)], device=entropy.device
+        )
+        return (self.log_temperature * (entropy - wanted)).sum()
+
+    def update(self, batch: Batch, generator: torch.Generator) -> Metrics:
+        """Critic, actor, temperatures, target."""
+        shape, clip = batch.action.continuous.shape, self.config.gradient_clip
+        loss, metrics = self.critic_loss(batch, torch.randn(shape, generator=generator))
+        metrics["critic_gradient"] = minimise(loss, self.critic, self.optimisers["critic"], clip)
+        loss, more = self.actor_loss(batch, torch.randn(shape, generator=generator))
+        metrics["actor_gradient"] = minimise(loss, self.actor, self.optimisers["actor"], clip)
+        entropy = more.pop("entropy")
+        loss = self.temperature_loss(entropy, self.spaces.choices)
+        minimise(loss, [self.log_temperature], self.optimisers["temperature"], None)
+        move_towards(self.target, self.critic, self.config.polyak)
+        names = ("entropy_continuous", "entropy_choice", "temperature_continuous", "temperature_choice")
+        values = (*entropy, *self.log_temperature.detach().exp())
+        return metrics | more | dict(zip(names, values, strict=True))
+
+    @torch.no_grad()
+    def act(self, observation: Observation, *, generator: torch.Generator, deterministic: bool = False) -> HybridAction:
+        """A sample of pi, or its mode."""
+        output = self.actor(observation)
+        if deterministic:
+            return HybridAction(torch.tanh(output.mean), output.logits.argmax(dim=-1))
+        noise = torch.randn(output.mean.shape, generator=generator)
+        choice = torch.multinomial(output.logits.softmax(dim=-1), 1, generator=generator).squeeze(-1)
+        return HybridAction(SquashedSample(output, noise).continuous, choice)

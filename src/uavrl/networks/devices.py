@@ -1,0 +1,197 @@
+"""Networks over the set of devices: they meet other layouts and another K, and do not care about the devices' order.
+
+A device's token and the aircraft's global vector each pass a first layer; tokens are pooled (mean and maximum over the
+devices) into the global vector, which goes back to every token; one output a device, one for idling (Zaheer et al.
+2017, "Deep sets").
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from uavrl.networks.interfaces import Actor, ActorOutput, Context, Critic, Denoiser, Observation
+from uavrl.networks.mlp import bounded_log_std, step_embedding
+
+TOKEN_FEATURES = 8
+GLOBAL_FEATURES = 6
+NEVER = -1e4  # logit and Q of a padded device
+
+
+def _place(offset_m: Tensor, scale_m: float) -> Tensor:
+    """Relative position and distance over `scale_m`, (..., 2) -> (..., 3)."""
+    scaled = offset_m / scale_m
+    return torch.cat([scaled, scaled.square().sum(dim=-1, keepdim=True).add(1e-8).sqrt()], dim=-1)
+
+
+def features(observation: Observation, scale_m: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Tokens (B, K, 8), globals (B, 6), validity (B, K) and relative positions in metres (B, K, 2).
+
+    Ages enter as log(1 + age) and as a share of the oldest: absolute for the value, relative for whom to serve.
+    """
+    if not isinstance(observation, dict):
+        raise TypeError('a set network takes observation = "devices"')
+    uav, devices = observation["uav"], observation["devices"]
+    offset, age, valid = devices[..., :2], devices[..., 2], devices[..., 5]
+    log_age = torch.log1p(age) * valid
+    oldest = (age * valid).amax(dim=1, keepdim=True)
+    share = age * valid / (oldest + 1e-3)
+    own = torch.stack([log_age, share, devices[..., 3], devices[..., 4] / 2.0, valid], dim=-1)
+    tokens = torch.cat([_place(offset, scale_m), own], dim=-1)
+    count = valid.sum(dim=1, keepdim=True)
+    globals_ = torch.cat(
+        [
+            uav[:, :2] / scale_m - 1.0,
+            torch.log1p(uav[:, 2:3]),
+            uav[:, 3:4],
+            torch.log1p(oldest),
+            log_age.sum(dim=1, keepdim=True) / count,
+        ],
+        dim=-1,
+    )
+    return tokens, globals_, valid, offset
+
+
+class SetTrunk(nn.Module):
+    """Tokens (B, K, .) and globals (B, .) to hidden vectors of both; `extra` inputs join the encoded ones later."""
+
+    def __init__(self, token_extra: int, global_extra: int, width: int) -> None:
+        super().__init__()
+        self.token = nn.Linear(TOKEN_FEATURES, width)
+        self.globals = nn.Linear(GLOBAL_FEATURES, width)
+        self.token_extra = nn.Linear(token_extra, width, bias=False) if token_extra else None
+        self.global_extra = nn.Linear(global_extra, width, bias=False) if global_extra else None
+        self.global_to_token = nn.Linear(width, width, bias=False)
+        self.token_hidden = nn.Linear(width, width)
+        self.pool = nn.Linear(2 * width, width, bias=False)
+        self.global_hidden = nn.Linear(width, width)
+        self.token_out = nn.Linear(width, width)
+        self.global_out = nn.Linear(width, width, bias=False)
+
+    def encode(self, tokens: Tensor, globals_: Tensor) -> tuple[Tensor, Tensor]:
+        """The first layer's observation part."""
+        return self.token(tokens), self.globals(globals_)
+
+    def forward(
+        self, token: Tensor, globals_: Tensor, valid: Tensor, token_extra: Tensor | None, global_extra: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Hidden vectors of tokens (B, K, width) and globals (B, width)."""
+        if self.global_extra is not None:
+            globals_ = globals_ + self.global_extra(global_extra)
+        if self.token_extra is not None:
+            token = token + self.token_extra(token_extra)
+        hidden = functional.silu(token + self.global_to_token(globals_)[:, None])
+        hidden = functional.silu(self.token_hidden(hidden))
+        mask = valid[..., None]
+        mean = (hidden * mask).sum(dim=1) / mask.sum(dim=1)
+        top = (hidden + (mask - 1.0) * 1e4).amax(dim=1)
+        globals_ = functional.silu(globals_ + self.pool(torch.cat([mean, top], dim=-1)))
+        globals_ = functional.silu(self.global_hidden(globals_))
+        hidden = functional.silu(self.token_out(hidden) + self.global_out(globals_)[:, None])
+        return hidden, globals_
+
+
+class _SetQ(nn.Module):
+    """One Q function with an output for each device and one for idling."""
+
+    def __init__(self, continuous: int, width: int, scale_m: float, reach_m: float) -> None:
+        super().__init__()
+        self.scale_m, self.reach_m = scale_m, reach_m
+        self.trunk = SetTrunk(3, continuous, width)
+        self.device_out = nn.Linear(width, 1)
+        self.idle_out = nn.Linear(width, 1)
+
+    def all_choices(self, context: Context, valid: Tensor, offset: Tensor, continuous: Tensor) -> Tensor:
+        token, globals_ = context
+        # the link that will carry the packet is the one after the move, which a disc of reach_m limits
+        move = self.reach_m * continuous / continuous.norm(dim=1, keepdim=True).clamp(min=1.0)
+        after = _place(offset - move[:, None], self.scale_m)
+        hidden, whole = self.trunk(token, globals_, valid, after, continuous)
+        devices = torch.where(valid > 0, self.device_out(hidden).squeeze(-1), NEVER)
+        return torch.cat([self.idle_out(whole), devices], dim=-1)
+
+
+class SetCritic(Critic):
+    """Two Q functions over the set of devices; all K + 1 choices cost one pass."""
+
+    def __init__(self, continuous: int, *, width: int, scale_m: float, reach_m: float) -> None:
+        super().__init__()
+        self.scale_m = scale_m
+        self.first = _SetQ(continuous, width, scale_m, reach_m)
+        self.second = _SetQ(continuous, width, scale_m, reach_m)
+
+    def encode(self, observation: Observation) -> Context:
+        """First layers of both Q functions, validity and relative positions."""
+        tokens, globals_, valid, offset = features(observation, self.scale_m)
+        first = self.first.trunk.encode(tokens, globals_)
+        return (*first, *self.second.trunk.encode(tokens, globals_), valid, offset)
+
+    def all_choices(self, context: Context, continuous: Tensor) -> Tensor:
+        """See `Critic`."""
+        valid, offset = context[4:]
+        return torch.stack(
+            [
+                self.first.all_choices(context[:2], valid, offset, continuous),
+                self.second.all_choices(context[2:4], valid, offset, continuous),
+            ]
+        )
+
+    def value(self, context: Context, continuous: Tensor, choice: Tensor) -> Tensor:
+        """See `Critic`."""
+        return (self.all_choices(context, continuous) * choice).sum(dim=-1)
+
+    @torch.no_grad()
+    def shift(self, amount: float) -> None:
+        """See `Critic`."""
+        for q in (self.first, self.second):
+            q.device_out.bias.add_(amount)
+            q.idle_out.bias.add_(amount)
+
+
+class SetDenoiser(Denoiser):
+    """Predicted noise: displacement and idle entries from the global vector, each device's entry from its token."""
+
+    def __init__(self, continuous: int, *, width: int, scale_m: float) -> None:
+        super().__init__()
+        self.scale_m, self.continuous = scale_m, continuous
+        self.embedding_size = 16
+        self.trunk = SetTrunk(1, continuous + 1 + self.embedding_size, width)
+        self.device_out = nn.Linear(width, 1)
+        self.global_out = nn.Linear(width, continuous + 1)
+
+    def encode(self, observation: Observation) -> Context:
+        """First layer and validity."""
+        tokens, globals_, valid, _ = features(observation, self.scale_m)
+        return (*self.trunk.encode(tokens, globals_), valid)
+
+    def forward(self, context: Context, vector: Tensor, step: Tensor) -> Tensor:
+        """See `Denoiser`."""
+        token, globals_, valid = context
+        own, rest = vector[:, self.continuous + 1 :, None], vector[:, : self.continuous + 1]
+        whole = torch.cat([rest, step_embedding(step, self.embedding_size)], dim=-1)
+        hidden, whole = self.trunk(token, globals_, valid, own, whole)
+        return torch.cat([self.global_out(whole), self.device_out(hidden).squeeze(-1)], dim=-1)
+
+    def vector_size(self, context: Context) -> int:
+        """C + K + 1 for this observation's K."""
+        return self.continuous + 1 + context[2].shape[1]
+
+
+class SetActor(Actor):
+    """Gaussian over the displacement from the global vector, a logit a device from its token."""
+
+    def __init__(self, continuous: int, *, width: int, scale_m: float) -> None:
+        super().__init__()
+        self.scale_m, self.continuous = scale_m, continuous
+        self.trunk = SetTrunk(0, 0, width)
+        self.device_out = nn.Linear(width, 1)
+        self.global_out = nn.Linear(width, 2 * continuous + 1)
+
+    def forward(self, observation: Observation) -> ActorOutput:
+        """See `Actor`."""
+        tokens, globals_, valid, _ = features(observation, self.scale_m)
+        hidden, whole = self.trunk(*self.trunk.encode(tokens, globals_), valid, None, None)
+        mean, log_std, idle = self.global_out(whole).split([self.continuous, self.continuous, 1], dim=-1)
+        devices = torch.where(valid > 0, self.device_out(hidden).squeeze(-1), NEVER)
+        return ActorOutput(mean, bounded_log_std(log_std), torch.cat([idle, devices], dim=-1))

@@ -1,0 +1,72 @@
+"""What agents ask of their networks. B rows, C continuous entries, D choices.
+
+Every network first encodes the observation (`encode`), so that a chain of M denoising steps, or M candidate actions,
+pays for that part once; `repeat` then copies an encoding for several actions a row.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+from torch import Tensor, nn
+
+Observation = Tensor | dict[str, Tensor]  # (B, entries), or {"uav": (B, 4), "devices": (B, K, 6)}
+Context = tuple[Tensor, ...]  # an encoded observation, each entry batch first
+
+
+def repeat(context: Context, times: int) -> Context:
+    """Each row `times` times in a row, (B, ...) -> (B x times, ...)."""
+    return tuple(entry.repeat_interleave(times, dim=0) for entry in context)
+
+
+class ActorOutput(NamedTuple):
+    """A Gaussian over the continuous part (before tanh) and a categorical over the choice, independent given s."""
+
+    mean: Tensor  # (B, C)
+    log_std: Tensor  # (B, C)
+    logits: Tensor  # (B, D)
+
+
+class Critic(nn.Module, ABC):
+    """An ensemble of two Q functions of a hybrid action."""
+
+    @abstractmethod
+    def encode(self, observation: Observation) -> Context:
+        """The observation's part."""
+
+    @abstractmethod
+    def all_choices(self, context: Context, continuous: Tensor) -> Tensor:
+        """Q(s, w, d) for every d: (2, B, D) from w (B, C)."""
+
+    @abstractmethod
+    def value(self, context: Context, continuous: Tensor, choice: Tensor) -> Tensor:
+        """Q(s, w, d), (2, B), for d as weights over the choices (B, D): a one-hot, or a relaxation of one."""
+
+    @abstractmethod
+    def shift(self, amount: float) -> None:
+        """Add `amount` to every Q value: what a change of the reward's zero asks for."""
+
+
+class Denoiser(nn.Module, ABC):
+    """epsilon_theta(a^i, i, s) of eq. (reverse_QL)."""
+
+    @abstractmethod
+    def encode(self, observation: Observation) -> Context:
+        """The observation's part."""
+
+    @abstractmethod
+    def forward(self, context: Context, vector: Tensor, step: Tensor) -> Tensor:
+        """Predicted noise (B, C + D) of a noisy diffusion vector (B, C + D) at steps 1..M (B,)."""
+
+    @abstractmethod
+    def vector_size(self, context: Context) -> int:
+        """C + D for this observation."""
+
+
+class Actor(nn.Module, ABC):
+    """pi(w, d | s) of the Gaussian-categorical agents."""
+
+    @abstractmethod
+    def forward(self, observation: Observation) -> ActorOutput:
+        """Distribution of the hybrid action."""

@@ -1,0 +1,86 @@
+"""Run logs: one JSON object a line, and progress on the terminal."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+
+class MetricsLog:
+    """Appends rows to a JSONL file; a number that is not finite is written as null."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+
+    def write(self, row: Mapping[str, Any]) -> None:
+        """Append one row."""
+        clean = {
+            key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in row.items()
+        }
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(clean) + "\n")
+
+    def cut(self, step: int) -> None:
+        """Drop rows after `step`: what a run wrote beyond the checkpoint that it resumes from."""
+        if self.path.exists():
+            lines = self.path.read_text(encoding="utf-8").splitlines()
+            kept = [line for line in lines if line.endswith("}") and json.loads(line).get("step", 0) <= step]
+            self.path.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
+
+
+class Reporter(Protocol):
+    """Called with the number of finished steps and a short text."""
+
+    def __call__(self, done: int, text: str) -> None: ...
+
+
+@contextmanager
+def progress(title: str, total: int, unit: str) -> Iterator[Reporter]:
+    """Progress with rate and time left: a bar on a terminal, else a line every half minute on stderr."""
+    console = Console(stderr=True)
+    started = time.monotonic()
+    first: int | None = None
+    if console.is_terminal:
+        rate = TextColumn("{task.fields[rate]}")
+        columns = (
+            TextColumn(title),
+            BarColumn(),
+            MofNCompleteColumn(),
+            rate,
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+        )
+        with Progress(*columns, TextColumn("{task.fields[text]}"), console=console) as bar:
+            task = bar.add_task(title, total=total, rate="", text="")
+
+            def show(done: int, text: str) -> None:
+                nonlocal first
+                first = done if first is None else first
+                rate = (done - first) / max(time.monotonic() - started, 1e-9)
+                bar.update(task, completed=done, rate=f"{rate:,.0f} {unit}/s", text=text)
+
+            yield show
+        return
+    last = started
+
+    def tell(done: int, text: str) -> None:
+        nonlocal last, first
+        now = time.monotonic()
+        first = done if first is None else first
+        if now - last >= 30.0 or done >= total > first:
+            last = now
+            rate = (done - first) / max(now - started, 1e-9)
+            left = f"{(total - done) / rate:,.0f} s left" if rate > 0 else "time left unknown"
+            print(f"{title}: {done:,}/{total:,} {unit}, {rate:,.0f}/s, {left}  {text}", file=sys.stderr, flush=True)
+
+    yield tell

@@ -1,0 +1,256 @@
+"""Hybrid SAC learning online on the vector environment, its whole training logged: where the offline data come from."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import gymnasium
+import numpy as np
+import torch
+from pydantic import BaseModel, ConfigDict, Field
+
+from uavrl import ENVIRONMENT_ID
+from uavrl.agents.sac import Sac, SacConfig
+from uavrl.datasets.replay import ReplayLog
+from uavrl.datasets.transitions import Transitions, transition_columns
+from uavrl.errors import CheckpointError, ConfigError, DivergenceError
+from uavrl.networks import fit_normalisers
+from uavrl.scenario import Scenario, parse_scenario
+from uavrl.simulation.environment import DataCollectionVectorEnv
+from uavrl.simulation.state import FlightAction, Outcome, SimState
+from uavrl.training.batches import OBSERVATION_OF, spaces_of, to_batch, to_tensors, transformed
+from uavrl.training.checkpoint import (
+    agent_tensors,
+    load_checkpoint,
+    numpy_state,
+    recover,
+    restore_agent,
+    save_checkpoint,
+    set_numpy_state,
+)
+from uavrl.training.log import MetricsLog, Reporter
+
+EVALUATION_SEEDS = 1_000_000  # layouts and seeds from here on are for evaluation and never occur in training
+
+FIXED_LAYOUT = np.random.default_rng(0).uniform(0, 1000, (10, 2))
+
+
+class CollectConfig(BaseModel):
+    """A run of online learning."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    scenario: Scenario
+    layouts: Literal["fixed", "random"] = Field(description="one layout throughout, or a new one each episode")
+    agent: SacConfig = SacConfig()
+    episodes: int = Field(700, ge=1, description="flights to log")
+    environments: int = Field(8, ge=1, description="flights at a time")
+    random_steps: int = Field(10_000, ge=0, description="steps of uniformly random actions at the start")
+    steps_per_update: int = Field(8, ge=1, description="environment steps for each gradient step")
+    centre_every: int = Field(500, ge=1, description="updates between re-centrings of the reward")
+    seed: int = Field(0, ge=0, lt=EVALUATION_SEEDS, description="of layouts, starts, fading, exploration and weights")
+
+
+class OnlineLearner:
+    """Hybrid SAC with its environment and its log; `run` goes on from wherever it stands.
+
+    Rewards are centred on the median of the newest ones, and the critics' biases are moved by what that adds to every
+    return (reward centring, Naik et al. 2024, arXiv:2405.09999), so Q stays near 0 while the policy improves.
+    """
+
+    def __init__(self, config: CollectConfig) -> None:
+        self.config = config
+        scenario = config.scenario
+        if config.layouts == "fixed" and scenario.traffic.devices != len(FIXED_LAYOUT):
+            raise ConfigError(
+                f"layouts = 'fixed' has {len(FIXED_LAYOUT)} devices, devices = {scenario.traffic.devices}"
+            )
+        if scenario.limits.max_steps is None:
+            raise ConfigError("limits.max_steps is none, collecting needs a number of steps to size its log")
+        self.kind = OBSERVATION_OF[config.agent.network.kind]
+        environment = gymnasium.make_vec(
+            ENVIRONMENT_ID,
+            num_envs=config.environments,
+            vectorization_mode="vector_entry_point",
+            scenario=scenario,
+            layout=FIXED_LAYOUT if config.layouts == "fixed" else None,
+            observation=self.kind,
+        )
+        if not isinstance(environment.unwrapped, DataCollectionVectorEnv):
+            raise ConfigError(f"{ENVIRONMENT_ID} is registered by another package")
+        self.environment = environment.unwrapped
+        torch.manual_seed(config.seed)
+        self.agent = Sac(spaces_of(scenario, config.agent.network.kind), config.agent)
+        self.generator = torch.Generator().manual_seed(config.seed)
+        self.numbers = np.random.default_rng([config.seed, 1])
+        self.log = ReplayLog(scenario.traffic.devices, config.episodes * scenario.limits.max_steps)
+        self.observation, _ = self.environment.reset(seed=config.seed)
+        self.episode = np.arange(config.environments)
+        self.returns = np.zeros(config.environments)
+        self.ended = np.zeros(config.environments, dtype=bool)
+        self.finished = 0
+        self.updates = 0
+        self.centre = 0.0
+
+    def _act(self) -> FlightAction:
+        reach = self.config.scenario.airframe.max_displacement_m
+        count = self.config.environments
+        if len(self.log) < self.config.random_steps:
+            continuous = self.numbers.uniform(-1.0, 1.0, (count, 2))
+            return FlightAction(continuous * reach, self.numbers.integers(0, self.agent.spaces.choices, count))
+        action = self.agent.act(to_tensors(self.observation), generator=self.generator)
+        return FlightAction(action.continuous.double().numpy() * reach, action.choice.numpy())
+
+    def _fly(self) -> list[float]:
+        """One step of every environment, logged; the returns of the flights that ended in it."""
+        action, before = self._act(), self.environment.state
+        self.observation, reward, terminated, truncated, info = self.environment.step(
+            {"displacement_m": action.displacement_m, "device": action.device}
+        )
+        fresh = self.ended  # the environment reset these instead of stepping them
+        live = ~fresh & (self.episode < self.config.episodes)
+        outcome = Outcome(**{name: info[name] for name in Outcome.__dataclass_fields__})
+        columns = transition_columns(
+            self.environment.layout_m, before, action, self.environment.state, outcome, self.episode, before.step
+        )
+        self.log.append(columns, keep=live)
+        self.returns = np.where(fresh, 0.0, self.returns + reward)
+        self.ended = terminated | truncated
+        done = [float(value) for value in self.returns[self.ended & live]]
+        self.finished += len(done)
+        if self.ended.any():
+            following = self.episode.max() + 1 + np.arange(self.ended.sum())
+            self.episode = self.episode.copy()
+            self.episode[self.ended] = following
+        return done
+
+    def _recentre(self) -> None:
+        newest = np.arange(max(0, len(self.log) - 5_000), len(self.log))
+        centre = float(np.median(self.log.take(newest).reward))
+        if self.updates and not self.config.scenario.limits.energy_budget_j:
+            moved = (self.centre - centre) * self.config.agent.reward.scale / (1.0 - self.config.agent.discount)
+            self.agent.critic.shift(moved)
+            self.agent.target.shift(moved)
+        self.centre = centre if not self.config.scenario.limits.energy_budget_j else 0.0
+
+    def _learn(self) -> dict[str, torch.Tensor]:
+        if self.updates == 0:
+            first = self.log.take(np.arange(len(self.log)))
+            fit_normalisers(self.agent.networks, to_tensors(first.observations(self.kind, self.config.scenario)[0]))
+        if self.updates % self.config.centre_every == 0:
+            self._recentre()
+        rows = self.numbers.integers(0, len(self.log), self.config.agent.batch_size)
+        batch = to_batch(self.log.take(rows), self.kind, self.config.scenario)
+        reward = self.config.agent.reward
+        batch = replace(batch, reward=transformed(batch.reward, self.centre, reward.scale, reward))
+        self.updates += 1
+        return self.agent.update(batch, self.generator)
+
+    def run(self, directory: Path, report: Reporter, save_every: int = 20_000) -> Transitions:
+        """Fly and learn until all episodes are logged; checkpoints every `save_every` steps and on interrupt.
+
+        Raises:
+            DivergenceError: a loss is not finite; the last checkpoint stays.
+        """
+        log = MetricsLog(directory / "metrics.jsonl")
+        log.cut(len(self.log))
+        recent: list[float] = []
+        saved = len(self.log)
+        metrics: dict[str, torch.Tensor] = {}
+        try:
+            while self.finished < self.config.episodes:
+                for value in self._fly():
+                    recent = [*recent[-19:], value]
+                    log.write({"step": len(self.log), "episode": self.finished, "return": value})
+                if len(self.log) >= self.config.random_steps:
+                    while self.updates * self.config.steps_per_update < len(self.log) - self.config.random_steps:
+                        metrics = self._learn()
+                        if self.updates % 1000 == 0:
+                            row = {name: float(value) for name, value in metrics.items()}
+                            if not np.isfinite(row["critic_loss"]):
+                                raise DivergenceError(
+                                    f"critic_loss = {row['critic_loss']} after {self.updates} updates"
+                                )
+                            log.write({"step": len(self.log), "updates": self.updates, "centre": self.centre} | row)
+                mean = f", return {np.mean(recent):.0f} (last {len(recent)})" if recent else ""
+                report(len(self.log), f"episode {self.finished}{mean}")
+                if len(self.log) - saved >= save_every:
+                    self.save(directory)
+                    saved = len(self.log)
+        except KeyboardInterrupt:
+            self.save(directory)
+            raise
+        self.save(directory)
+        return self.log.to_transitions()
+
+    def save(self, directory: Path) -> None:
+        """Everything that `resume` needs, into directory/checkpoint."""
+        document = {
+            "kind": "online",
+            "agent": self.config.agent.name,
+            "config": self.config.agent.model_dump(mode="json"),
+            "spaces": self.agent.spaces.model_dump(),
+            "scenario": self.config.scenario.model_dump(mode="json"),
+            "collect": self.config.model_dump(mode="json"),
+            "step": len(self.log),
+            "finished": self.finished,
+            "updates": self.updates,
+            "centre": self.centre,
+            "numbers": numpy_state(self.numbers),
+            "environment": numpy_state(self.environment.np_random),
+        }
+        state = {
+            f"state.{name}": torch.from_numpy(value.copy()) for name, value in vars(self.environment.state).items()
+        }
+        loop = {
+            "layout_m": torch.from_numpy(self.environment.layout_m.copy()),
+            "episode": torch.from_numpy(self.episode.copy()),
+            "returns": torch.from_numpy(self.returns.copy()),
+            "ended": torch.from_numpy(self.ended.copy()),
+            "generator": self.generator.get_state(),
+        }
+        rows = {name: torch.from_numpy(value) for name, value in self.log.state_dict().items()}
+        tensors = agent_tensors(self.agent) | {"loop": state | loop, "log": rows}
+        save_checkpoint(directory / "checkpoint", document, tensors)
+
+    @classmethod
+    def resume(cls, directory: Path) -> OnlineLearner | None:
+        """The learner as it stood at its last checkpoint, None where there is none.
+
+        Raises:
+            CheckpointError: a damaged checkpoint.
+        """
+        path = recover(directory / "checkpoint")
+        if path is None:
+            return None
+        checkpoint = load_checkpoint(path)
+        document, tensors = checkpoint.document, checkpoint.tensors
+        if document.get("kind") != "online":
+            raise CheckpointError(f"checkpoint '{path}' is of kind {document.get('kind')!r}, allowed: 'online'")
+        collect = dict(document["collect"])
+        learner = cls(CollectConfig(**{**collect, "scenario": parse_scenario(collect["scenario"])}))
+        restore_agent(learner.agent, tensors)
+        loop = {name: tensor.numpy() for name, tensor in tensors["loop"].items()}
+        learner.log.load_state_dict({name: tensor.numpy() for name, tensor in tensors["log"].items()})
+        learner.environment.restore(
+            SimState(**{name: loop[f"state.{name}"] for name in SimState.__dataclass_fields__}),
+            loop["layout_m"],
+            loop["ended"],
+        )
+        set_numpy_state(learner.environment.np_random, document["environment"])
+        set_numpy_state(learner.numbers, document["numbers"])
+        learner.generator.set_state(tensors["loop"]["generator"])
+        learner.episode, learner.returns, learner.ended = loop["episode"], loop["returns"], loop["ended"]
+        learner.finished, learner.updates = document["finished"], document["updates"]
+        learner.centre = document["centre"]
+        learner.observation = learner.environment.observation()
+        return learner
+
+
+def same_run(directory: Path, config: CollectConfig) -> bool:
+    """Whether the checkpoint in `directory` was made by this configuration."""
+    document = load_checkpoint(directory / "checkpoint").document
+    return bool(document.get("collect") == json.loads(config.model_dump_json()))
