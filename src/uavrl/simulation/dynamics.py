@@ -64,6 +64,20 @@ def _transmit(
     return snr, rate, xp.full_like(snr, bits)
 
 
+def age_term(scenario: Scenario, age_s: Array, next_age_s: Array, duration_s: Array) -> Array:
+    """Age part of eq. (reward), (N,): ages (N, K) after the step, or integrated over it, weighted by delta_k."""
+    xp = array_namespace(age_s)
+    objective, traffic = scenario.objective, scenario.traffic
+    cost = next_age_s
+    if objective.reward == "per_second":
+        cost = age.age_integral_s2(age_s, duration_s, traffic.max_age_s)
+    if traffic.priority is None:
+        weighted = xp.mean(cost, axis=1)
+    else:
+        weighted = xp.sum(cost * xp.asarray(traffic.priority, dtype=cost.dtype, device=cost.device), axis=1)
+    return weighted / objective.age_reference_s
+
+
 def advance(
     scenario: Scenario,
     layout_m: Array,
@@ -117,16 +131,9 @@ def advance(
     devices = xp.arange(1, layout_m.shape[1] + 1, dtype=action.device.dtype, device=action.device.device)
     reset = arrived[:, None] & (action.device[:, None] == devices)
     ages = age.next_age_s(state.age_s, reset, duration_s, traffic.max_age_s)
-    cost = ages
-    if objective.reward == "per_second":
-        cost = age.age_integral_s2(state.age_s, duration_s, traffic.max_age_s)
-    if traffic.priority is None:
-        weighted = xp.mean(cost, axis=1)
-    else:
-        weighted = xp.sum(cost * xp.asarray(traffic.priority, dtype=cost.dtype, device=cost.device), axis=1)
-    age_term = weighted / objective.age_reference_s
+    age_cost = age_term(scenario, state.age_s, ages, duration_s)
     energy_term = total_j / hover_reference_j(scenario, energy.hover_power_w(frame))
-    reward = -(objective.age_weight * age_term + (1.0 - objective.age_weight) * energy_term)  # eq. (reward)
+    reward = -(objective.age_weight * age_cost + (1.0 - objective.age_weight) * energy_term)  # eq. (reward)
 
     after = SimState(
         position_m=position,
@@ -144,7 +151,7 @@ def advance(
         truncated = truncated | (after.time_s > limits.time_budget_s)
     outcome = Outcome(
         reward=reward,
-        age_term=age_term,
+        age_term=age_cost,
         energy_term=energy_term,
         displacement_m=moved,
         duration_s=duration_s,

@@ -1,0 +1,85 @@
+"""`uavrl data`: show, select and convert logged flights."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from uavrl.datasets.flat import SUFFIXES, save_flat
+from uavrl.datasets.minari_io import write_minari
+from uavrl.datasets.report import describe, render
+from uavrl.datasets.selection import Quality, select
+from uavrl.datasets.sources import load_source
+from uavrl.simulation.observations import ObservationKind
+
+Source = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME|FILE|MINARI_ID")]
+
+
+@dataclass(frozen=True)
+class DataShow:
+    """Report what logged flights hold: behaviour, coverage, choices."""
+
+    source: Source
+    """fixed or layouts, a .parquet or .npz file, or the id of a Minari dataset"""
+    scenario: str | None = None
+    """preset or .toml file that it was flown in; none: the one it carries"""
+    json: Path | None = None
+    """file to write the figures to"""
+
+    def run(self) -> None:
+        transitions, scenario = load_source(self.source, self.scenario)
+        summary = describe(transitions, scenario)
+        Console().print(render(summary, self.source))
+        if self.json is not None:
+            self.json.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+
+
+@dataclass(frozen=True)
+class DataSelect:
+    """Write a seeded part of a training's log to a flat file."""
+
+    source: Source
+    """fixed or layouts, a .parquet or .npz file, or the id of a Minari dataset"""
+    out: Path
+    """.parquet or .npz file to write"""
+    size: int = 30_000
+    """transitions"""
+    quality: Quality = "mixed"
+    """mixed: uniform over training; good: its last third; bad: its first third"""
+    seed: int = 0
+    """seed of the draw; for one seed, a smaller set is part of a larger one"""
+    scenario: str | None = None
+    """preset or .toml file that it was flown in; none: the one it carries"""
+
+    def run(self) -> None:
+        transitions, scenario = load_source(self.source, self.scenario)
+        selected = select(transitions, self.size, self.quality, self.seed)
+        save_flat(self.out, selected, scenario)
+        Console().print(f"{self.out}: {selected!r}", highlight=False, soft_wrap=True)
+
+
+@dataclass(frozen=True)
+class DataConvert:
+    """Write logged flights in another form."""
+
+    source: Source
+    """fixed or layouts, a .parquet or .npz file, or the id of a Minari dataset"""
+    target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="FILE|MINARI_ID")]
+    """.parquet or .npz file, or the id of a new Minari dataset (whole episodes only)"""
+    scenario: str | None = None
+    """preset or .toml file that it was flown in; none: the one it carries"""
+    observation: ObservationKind = "devices"
+    """observations of a Minari dataset"""
+
+    def run(self) -> None:
+        transitions, scenario = load_source(self.source, self.scenario)
+        if Path(self.target).suffix in SUFFIXES:
+            save_flat(self.target, transitions, scenario)
+        else:
+            write_minari(self.target, transitions, scenario, self.observation)
+        Console().print(f"{self.target}: {transitions!r}", highlight=False, soft_wrap=True)

@@ -1,0 +1,30 @@
+"""Logged flights: in memory, as flat files, as Minari datasets; selection, validation and a report on them."""
+
+from uavrl.datasets.flat import load_flat, save_flat, stored_scenario
+from uavrl.datasets.minari_io import read_minari, write_minari
+from uavrl.datasets.replay import ReplayLog
+from uavrl.datasets.report import describe
+from uavrl.datasets.selection import Quality, select
+from uavrl.datasets.sources import builtin_names, load_builtin, load_source
+from uavrl.datasets.transitions import COLUMNS, Transitions, concatenate, transition_columns
+from uavrl.datasets.validation import validate
+
+__all__ = [
+    "COLUMNS",
+    "Quality",
+    "ReplayLog",
+    "Transitions",
+    "builtin_names",
+    "concatenate",
+    "describe",
+    "load_builtin",
+    "load_flat",
+    "load_source",
+    "read_minari",
+    "save_flat",
+    "select",
+    "stored_scenario",
+    "transition_columns",
+    "validate",
+    "write_minari",
+]
