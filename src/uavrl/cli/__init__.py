@@ -107,7 +107,7 @@ def parse(name: str, words: Sequence[str]) -> Any:
 
 def _condense(box: str) -> str:
     """One line from the framed text with which tyro refuses its arguments: what comes before the help."""
-    lines = []
+    lines: list[str] = []
     for raw in box.splitlines():
         line = " ".join(_BOX.sub("", raw).split())
         if not line and lines and "\u2500" in raw:

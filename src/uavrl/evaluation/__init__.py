@@ -1,0 +1,1 @@
+"""Judge policies: equal flights for all, metrics, bootstrap intervals, reports."""
