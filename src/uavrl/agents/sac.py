@@ -37,7 +37,10 @@ class SacConfig(AgentConfig):
     """Settings of hybrid SAC."""
 
     name: Literal["sac"] = "sac"
-    reward: RewardConfig = RewardConfig(transform="none", clip=10.0)
+    reward: RewardConfig = RewardConfig(transform="centred", clip=10.0)
+    batch_size: int = Field(128, ge=1, description="transitions an update")
+    learning_rate: float = Field(6e-4, gt=0, description="of Adam")
+    discount: float = Field(0.995, ge=0, lt=1, description="gamma; at .99 a flight to a better place barely pays")
     continuous_entropy: float = Field(-2.0, description="target entropy of tanh w, H_c")
     choice_entropy: float = Field(0.3, ge=0, lt=1, description="target entropy of d, as a share of log D")
     initial_temperature: float = Field(0.1, gt=0, description="both temperatures at the start")

@@ -1,8 +1,8 @@
 """Networks over the set of devices: they meet other layouts and another K, and do not care about the devices' order.
 
-A device's token and the aircraft's global vector each pass a first layer; tokens are pooled (mean and maximum over the
-devices) into the global vector, which goes back to every token; one output a device, one for idling (Zaheer et al.
-2017, "Deep sets").
+A device's token and the aircraft's global vector each pass a first layer; tokens are pooled into the global vector,
+which goes back to every token; one output a device, one for idling (Zaheer et al. 2017, "Deep sets"; Lee et al. 2019,
+"Set Transformer", for the weighted pooling).
 """
 
 from __future__ import annotations
@@ -54,17 +54,25 @@ def features(observation: Observation, scale_m: float) -> tuple[Tensor, Tensor, 
 
 
 class SetTrunk(nn.Module):
-    """Tokens (B, K, .) and globals (B, .) to hidden vectors of both; `extra` inputs join the encoded ones later."""
+    """Tokens (B, K, .) and globals (B, .) to hidden vectors of both; `extra` inputs join the encoded ones later.
+
+    Pooling is the mean and `HEADS` softmax-weighted means of the tokens, one matrix product in all: a maximum costs as
+    much as a layer on a CPU. Padded devices have weight 0.
+    """
+
+    HEADS = 3
 
     def __init__(self, token_extra: int, global_extra: int, width: int) -> None:
         super().__init__()
+        self.width = width
         self.token = nn.Linear(TOKEN_FEATURES, width)
         self.globals = nn.Linear(GLOBAL_FEATURES, width)
         self.token_extra = nn.Linear(token_extra, width, bias=False) if token_extra else None
         self.global_extra = nn.Linear(global_extra, width, bias=False) if global_extra else None
         self.global_to_token = nn.Linear(width, width, bias=False)
         self.token_hidden = nn.Linear(width, width)
-        self.pool = nn.Linear(2 * width, width, bias=False)
+        self.score = nn.Linear(width, self.HEADS, bias=False)
+        self.pool = nn.Linear((1 + self.HEADS) * width, width, bias=False)
         self.global_hidden = nn.Linear(width, width)
         self.token_out = nn.Linear(width, width)
         self.global_out = nn.Linear(width, width, bias=False)
@@ -77,16 +85,17 @@ class SetTrunk(nn.Module):
         self, token: Tensor, globals_: Tensor, valid: Tensor, token_extra: Tensor | None, global_extra: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Hidden vectors of tokens (B, K, width) and globals (B, width)."""
-        if self.global_extra is not None:
+        if self.global_extra is not None and global_extra is not None:
             globals_ = globals_ + self.global_extra(global_extra)
-        if self.token_extra is not None:
-            token = token + self.token_extra(token_extra)
+        if self.token_extra is not None and token_extra is not None:
+            flat = token_extra.reshape(-1, token_extra.shape[-1])
+            token = torch.addmm(token.reshape(-1, self.width), flat, self.token_extra.weight.T).view_as(token)
         hidden = functional.silu(token + self.global_to_token(globals_)[:, None])
         hidden = functional.silu(self.token_hidden(hidden))
-        mask = valid[..., None]
-        mean = (hidden * mask).sum(dim=1) / mask.sum(dim=1)
-        top = (hidden + (mask - 1.0) * 1e4).amax(dim=1)
-        globals_ = functional.silu(globals_ + self.pool(torch.cat([mean, top], dim=-1)))
+        mask = valid[:, None]
+        score = self.score(hidden).transpose(1, 2) + (mask - 1.0) * -NEVER
+        weight = torch.cat([mask / mask.sum(dim=2, keepdim=True), score.softmax(dim=2)], dim=1)
+        globals_ = functional.silu(globals_ + self.pool((weight @ hidden).flatten(1)))
         globals_ = functional.silu(self.global_hidden(globals_))
         hidden = functional.silu(self.token_out(hidden) + self.global_out(globals_)[:, None])
         return hidden, globals_

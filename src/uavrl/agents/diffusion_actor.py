@@ -1,0 +1,116 @@
+"""The denoising-diffusion actor: a policy over hybrid actions as a chain from noise to the vector [w, 2 onehot(d) - 1].
+
+Paper, Section V-B. All noise is an argument; `ChainNoise.draw` is the one place that makes it.
+"""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from typing import Literal, NamedTuple
+
+import torch
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor, nn
+
+from uavrl.actions import HybridAction, decode
+from uavrl.diffusion import Schedule, ScheduleName, ddim, ddpm, make_schedule
+from uavrl.networks import Denoiser, NetworkConfig, Spaces, make_denoiser
+from uavrl.networks.interfaces import Context
+
+
+class DiffusionConfig(BaseModel):
+    """The chain."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    schedule: ScheduleName = Field("vp", description="noise schedule; the paper has linear, unscaled")
+    steps: int = Field(5, ge=1, description="M, denoising steps")
+    sampler: Literal["ddpm", "ddim"] = Field("ddpm", description="ancestral, or DDIM with ddim_eta")
+    variance: Literal["posterior", "beta"] = Field(
+        "posterior", description="of ddpm's noise; the paper prints beta, the posterior variance is beta-tilde"
+    )
+    ddim_eta: float = Field(0.0, ge=0, le=1, description="0: deterministic, 1: as ddpm with the posterior variance")
+    clip_x0: bool = Field(True, description="hold each predicted x_0 in [-1, 1]; the paper does not")
+
+
+class ChainNoise(NamedTuple):
+    """Randomness of one chain of N samples."""
+
+    start: Tensor  # (N, C + D)
+    steps: Tensor  # (M, N, C + D)
+
+    @classmethod
+    def draw(cls, count: int, size: int, steps: int, generator: torch.Generator) -> ChainNoise:
+        """Standard normal noise for `count` samples of `size` entries."""
+        both = torch.randn((steps + 1, count, size), generator=generator, device=generator.device)
+        return cls(both[0], both[1:])
+
+
+class DiffusionActor(nn.Module):
+    """A denoiser and its exponential moving average, the target actor, which also acts."""
+
+    def __init__(self, spaces: Spaces, network: NetworkConfig, config: DiffusionConfig) -> None:
+        super().__init__()
+        self.config, self.continuous = config, spaces.continuous
+        self.denoiser = make_denoiser(spaces, network)
+        self.average = deepcopy(self.denoiser).requires_grad_(False)
+        self._schedule = make_schedule(config.schedule, config.steps)
+
+    def schedule(self, device: torch.device) -> Schedule:
+        """The noise schedule on `device`."""
+        if self._schedule.beta.device != device:
+            self._schedule = self._schedule.to(device)
+        return self._schedule
+
+    def sample(
+        self, denoiser: Denoiser, context: Context, noise: ChainNoise, gradient_steps: int | None = None
+    ) -> Tensor:
+        """x_0 (N, C + D) of the chain from `noise`, eq. (reverse_QL); the graph holds the last `gradient_steps`."""
+        schedule, config = self.schedule(noise.start.device), self.config
+
+        def predict(vector: Tensor, step: Tensor) -> Tensor:
+            predicted: Tensor = denoiser(context, vector, step)
+            return predicted
+
+        if config.sampler == "ddim":
+            return ddim(
+                predict,
+                schedule,
+                noise.start,
+                noise.steps,
+                ddim_eta=config.ddim_eta,
+                clip_x0=config.clip_x0,
+                gradient_steps=gradient_steps,
+            )
+        return ddpm(
+            predict,
+            schedule,
+            noise.start,
+            noise.steps,
+            variance=config.variance,
+            clip_x0=config.clip_x0,
+            gradient_steps=gradient_steps,
+        )
+
+    @torch.no_grad()
+    def act(self, context: Context, generator: torch.Generator, deterministic: bool) -> HybridAction:
+        """One action a row by the average network; deterministic: DDIM from zero noise."""
+        size, count = self.average.vector_size(context), len(context[0])
+        if deterministic:
+            schedule = self.schedule(generator.device)
+            start = torch.zeros((count, size), device=generator.device)
+
+            def predict(vector: Tensor, step: Tensor) -> Tensor:
+                predicted: Tensor = self.average(context, vector, step)
+                return predicted
+
+            return decode(ddim(predict, schedule, start, None, clip_x0=self.config.clip_x0), self.continuous)
+        noise = ChainNoise.draw(count, size, self.config.steps, generator)
+        return decode(self.sample(self.average, context, noise), self.continuous)
+
+
+def block_mean(error: Tensor, continuous: int, weight: float) -> Tensor:
+    """Mean of squared errors (B, C + D) with `weight` on the C continuous entries, which D choice entries outnumber."""
+    scale = torch.ones(error.shape[-1], device=error.device)
+    scale[:continuous] = weight
+    return (error.mean(dim=0) * scale).sum() / scale.sum()

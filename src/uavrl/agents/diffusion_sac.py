@@ -1,0 +1,219 @@
+r"""Diffusion-SAC (paper, Section V, Algorithm 2): a diffusion actor guided by a double-Q critic, offline.
+
+Critic, eqs. (bellman_error), (crtici_CQL), for each Q_j:
+    L = 1/2 E[(Q_j(s, a) - r - \gamma \min_j Q'_j(s', a'))^2]
+        + \alpha E[\log \sum_d E_{w \sim U}[e^{Q_j(s, w, d)}] 2^C - Q_j(s, a)],   a' from the target actor
+Actor, eqs. (diffRL_loss), (Q_guidance_Loss), (actor_loss_all):
+    L = \eta L_bc + (1 - \eta) L_g,   L_g = -E[\sum_d p_d \min_j Q_j(s, w, d)] / sg(mean |Q|),  p = softmax(z / \tau)
+where [w, z] is what the denoising chain returns. The guidance must reach the actor's weights through that chain, for w
+and for z alike: an argmax or a sampler without graph would leave nothing but behaviour cloning.
+"""
+
+from __future__ import annotations
+
+import math
+from copy import deepcopy
+from typing import Literal, Self
+
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor, nn
+from torch.nn import functional
+
+from uavrl.actions import HybridAction, decode, encode
+from uavrl.agents.base import Agent, AgentConfig, Batch, Metrics, adam, discounts, minimise, move_towards
+from uavrl.agents.diffusion_actor import ChainNoise, DiffusionActor, DiffusionConfig, block_mean
+from uavrl.diffusion import add_noise, predict_x0, straight_through_clamp
+from uavrl.networks import Critic, Observation, Spaces, make_critic, repeat
+from uavrl.networks.interfaces import Context
+
+
+class DiffusionSacConfig(AgentConfig):
+    """Settings of Diffusion-SAC. Names follow their meaning; the paper's letters are beside them."""
+
+    name: Literal["diffusion_sac"] = "diffusion_sac"
+    diffusion: DiffusionConfig = DiffusionConfig()
+    bc_weight: float = Field(0.5, ge=0, le=1, description="eta of eq. (actor_loss_all)")
+    cql_weight: float = Field(0.0, ge=0, description="alpha of eq. (crtici_CQL); 0 skips the penalty")
+    cql_samples: int = Field(10, ge=1, description="uniform displacements in the penalty's sum")
+    guidance: Literal["expectation", "straight_through", "softmax"] = Field(
+        "expectation",
+        description="choice in L_g: expected Q over p; argmax with p's gradient; or p itself as the critic's input",
+    )
+    gradient: Literal["full_chain", "last_k", "one_step"] = Field(
+        "one_step",
+        description="L_g through the whole chain (paper), its last gradient_steps, or one pass from a noised action",
+    )
+    gradient_steps: int = Field(1, ge=1, description="k of last_k")
+    choice_temperature: float = Field(0.5, gt=0, description="tau of p = softmax(z / tau)")
+    normalise_q: bool = Field(True, description="divide L_g by the batch's mean |Q|, which gives eta a meaning")
+    displacement_weight: float = Field(3.0, gt=0, description="weight of a continuous entry in L_bc; 1 in the paper")
+    actor_average: float = Field(0.995, ge=0, lt=1, description="decay of the target actor; 0: no average")
+    candidates: int = Field(1, ge=1, description="actions drawn at a decision; the one of largest min Q is taken")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.gradient == "last_k" and self.gradient_steps > self.diffusion.steps:
+            raise ValueError(
+                f"gradient_steps = {self.gradient_steps} must be <= diffusion.steps = {self.diffusion.steps}"
+            )
+        if self.guidance == "softmax" and (self.network.kind != "mlp" or self.network.choice_heads):
+            raise ValueError(
+                "guidance = 'softmax' needs a critic with the choice as input: kind 'mlp', choice_heads false"
+            )
+        return self
+
+
+class DiffusionSac(Agent):
+    """Diffusion-SAC for declared spaces."""
+
+    config: DiffusionSacConfig
+
+    def __init__(self, spaces: Spaces, config: DiffusionSacConfig) -> None:
+        self.spaces, self.config = spaces, config
+        self.actor = DiffusionActor(spaces, config.network, config.diffusion)
+        self.critic = make_critic(spaces, config.network)
+        self.target = deepcopy(self.critic).requires_grad_(False)
+        self.networks = nn.ModuleDict({"actor": self.actor, "critic": self.critic, "target": self.target})
+        self.optimisers = {
+            "actor": adam(self.actor.denoiser.parameters(), config),
+            "critic": adam(self.critic.parameters(), config),
+        }
+
+    def critic_loss(self, batch: Batch, noise: ChainNoise, uniform: Tensor | None) -> tuple[Tensor, Metrics]:
+        """Eq. (crtici_CQL), both Q functions summed.
+
+        Args:
+            batch: B transitions.
+            noise: of the target actor's chain at s', B samples.
+            uniform: (B x cql_samples, C) displacements in [-1, 1] of the penalty; None where its weight is 0.
+        """
+        with torch.no_grad():
+            vector = self.actor.sample(self.actor.average, self.actor.average.encode(batch.next_observation), noise)
+            following = decode(vector, self.spaces.continuous)
+            q_next = action_value(
+                self.target, self.target.encode(batch.next_observation), following, self.spaces.choices
+            ).amin(dim=0)
+            target = batch.reward + discounts(batch, self.config) * q_next
+        context = self.critic.encode(batch.observation)
+        q = action_value(self.critic, context, batch.action, self.spaces.choices)
+        loss = 0.5 * (q - target).square().mean(dim=1).sum()
+        metrics = {"bellman_loss": loss.detach(), "q": q.detach().mean(), "target_q": target.mean()}
+        if uniform is not None:
+            penalty = conservative_penalty(self.critic, context, uniform, q)
+            loss = loss + self.config.cql_weight * penalty
+            metrics["cql_penalty"] = penalty.detach()
+        return loss, metrics | {"critic_loss": loss.detach()}
+
+    def actor_loss(self, batch: Batch, step: Tensor, noise: Tensor, chain: ChainNoise | None) -> tuple[Tensor, Metrics]:
+        """Eq. (actor_loss_all).
+
+        Args:
+            batch: B transitions.
+            step: (B,) denoising steps in 1..M of L_bc, and of a one-step L_g.
+            noise: (B, C + D) of the same.
+            chain: of the chain whose actions L_g judges; None where the gradient is one_step or L_g has no weight.
+        """
+        config, denoiser = self.config, self.actor.denoiser
+        context = denoiser.encode(batch.observation)
+        eta, loss = config.bc_weight, torch.zeros((), device=noise.device)
+        metrics: Metrics = {}
+        vector = None
+        if eta > 0 or chain is None:
+            schedule = self.actor.schedule(noise.device)
+            noised = add_noise(schedule, encode(batch.action, self.spaces.choices), step, noise)
+            predicted = denoiser(context, noised, step)
+            bc_loss = block_mean((noise - predicted).square(), self.spaces.continuous, config.displacement_weight)
+            loss = loss + eta * bc_loss
+            metrics["bc_loss"] = bc_loss.detach()
+            vector = predict_x0(schedule, noised, step, predicted, config.diffusion.clip_x0)
+        if eta < 1:
+            if chain is not None:
+                steps = config.gradient_steps if config.gradient == "last_k" else None
+                vector = self.actor.sample(denoiser, context, chain, steps)
+            assert vector is not None  # noqa: S101  # for the type checker: one of the two branches above has run
+            guidance, more = self.guidance_loss(batch.observation, vector)
+            loss = loss + (1.0 - eta) * guidance
+            metrics |= more
+        return loss, metrics | {"actor_loss": loss.detach()}
+
+    def guidance_loss(self, observation: Observation, vector: Tensor) -> tuple[Tensor, Metrics]:
+        """Eq. (Q_guidance_Loss) of chain outputs `vector` (B, C + D), with gradient in both of its blocks."""
+        config, continuous = self.config, self.spaces.continuous
+        w, z = straight_through_clamp(vector[:, :continuous]), vector[:, continuous:]
+        probability = functional.softmax(z / config.choice_temperature, dim=-1)
+        with torch.no_grad():
+            context = self.critic.encode(observation)
+        if config.guidance == "softmax":
+            q = self.critic.value(context, w, probability).amin(dim=0)
+        else:
+            weight = probability
+            if config.guidance == "straight_through":
+                hard = functional.one_hot(z.argmax(dim=-1), z.shape[-1]).to(z.dtype)
+                weight = hard + probability - probability.detach()
+            q = (self.critic.all_choices(context, w).amin(dim=0) * weight).sum(dim=-1)
+        scale = q.detach().abs().mean().clamp(min=1e-3) if config.normalise_q else 1.0
+        metrics = {"guided_q": q.detach().mean(), "choice_confidence": probability.detach().amax(dim=-1).mean()}
+        return -q.mean() / scale, metrics
+
+    def update(self, batch: Batch, generator: torch.Generator) -> Metrics:
+        """Critic, actor, target critic, target actor; what has no weight is not computed."""
+        config, device, count = self.config, generator.device, len(batch.reward)
+        continuous, steps = self.spaces.continuous, config.diffusion.steps
+        size = continuous + self.spaces.choices
+        chain = ChainNoise.draw(count, size, steps, generator)
+        uniform = None
+        if config.cql_weight > 0:
+            shape = (count * config.cql_samples, continuous)
+            uniform = 2.0 * torch.rand(shape, generator=generator, device=device) - 1.0
+        loss, metrics = self.critic_loss(batch, chain, uniform)
+        clip = config.gradient_clip
+        metrics["critic_gradient"] = minimise(loss, self.critic, self.optimisers["critic"], clip)
+
+        step = torch.randint(1, steps + 1, (count,), generator=generator, device=device)
+        noise = torch.randn((count, size), generator=generator, device=device)
+        guided = config.bc_weight < 1 and config.gradient != "one_step"
+        chain_for_actor = ChainNoise.draw(count, size, steps, generator) if guided else None
+        loss, more = self.actor_loss(batch, step, noise, chain_for_actor)
+        metrics["actor_gradient"] = minimise(loss, self.actor.denoiser, self.optimisers["actor"], clip)
+
+        move_towards(self.target, self.critic, config.polyak)
+        move_towards(self.actor.average, self.actor.denoiser, 1.0 - config.actor_average)
+        return metrics | more
+
+    @torch.no_grad()
+    def act(self, observation: Observation, *, generator: torch.Generator, deterministic: bool = False) -> HybridAction:
+        """A sample of the target actor's chain, the best of `candidates` by min Q; deterministic: DDIM from zero."""
+        context, count = self.actor.average.encode(observation), self.config.candidates
+        if deterministic or count == 1:
+            return self.actor.act(context, generator, deterministic)
+        drawn = self.actor.act(repeat(context, count), generator, deterministic=False)
+        choices = self.actor.average.vector_size(context) - self.spaces.continuous
+        q = action_value(self.critic, repeat(self.critic.encode(observation), count), drawn, choices).amin(dim=0)
+        rows = len(context[0])
+        best = q.view(rows, count).argmax(dim=1) + count * torch.arange(rows, device=q.device)
+        return HybridAction(drawn.continuous[best], drawn.choice[best])
+
+
+def action_value(critic: Critic, context: Context, action: HybridAction, choices: int) -> Tensor:
+    """Q of hybrid actions, (2, B); the critic sees a legal one-hot of D = `choices`."""
+    return critic.value(context, action.continuous, functional.one_hot(action.choice, choices).float())
+
+
+def conservative_penalty(critic: Critic, context: Context, uniform: Tensor, q_data: Tensor) -> Tensor:
+    """log-sum-exp of Q over actions less Q of the data, eq. (crtici_CQL), mean over rows, both Q functions summed.
+
+    The sum is exact over d and importance-weighted over w: N uniform w of density 2^-C stand for the integral.
+
+    Args:
+        critic: two Q functions.
+        context: encoded observations, B rows.
+        uniform: (B x N, C) displacements, N of each row in a row.
+        q_data: (2, B) Q of the data's actions.
+    """
+    rows = q_data.shape[1]
+    samples = len(uniform) // rows
+    q = critic.all_choices(repeat(context, samples), uniform)  # (2, B N, D)
+    weighted = q + (uniform.shape[1] * math.log(2.0) - math.log(samples))
+    total = weighted.view(2, rows, -1).logsumexp(dim=-1)
+    return (total - q_data).mean(dim=1).sum()

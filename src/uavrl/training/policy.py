@@ -1,0 +1,82 @@
+"""A trained agent as a policy that `evaluate` can fly."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from pydantic import TypeAdapter, ValidationError
+
+from uavrl.agents.base import Agent
+from uavrl.agents.registry import AnyConfig, make_agent
+from uavrl.errors import CheckpointError
+from uavrl.networks import Spaces
+from uavrl.scenario import Scenario, parse_scenario
+from uavrl.simulation.state import FlightAction
+from uavrl.training.batches import OBSERVATION_OF, to_tensors
+from uavrl.training.checkpoint import Checkpoint, load_checkpoint, restore_networks
+
+
+class AgentPolicy:
+    """Maps observations to displacements in metres and devices."""
+
+    def __init__(self, name: str, agent: Agent, scenario: Scenario) -> None:
+        self.name = name
+        self.agent = agent
+        self.reach_m = scenario.airframe.max_displacement_m
+        self.needs: Literal["paper", "devices", "state"] = OBSERVATION_OF[agent.config.network.kind]
+
+    def reset(self, count: int) -> None:
+        """Nothing is remembered between steps."""
+
+    def act(self, observation: Any, *, generator: np.random.Generator, deterministic: bool = False) -> FlightAction:
+        """One action a flight; its torch generator is seeded from `generator`."""
+        draws = torch.Generator().manual_seed(int(generator.integers(2**62)))
+        action = self.agent.act(to_tensors(observation), generator=draws, deterministic=deterministic)
+        return FlightAction(action.continuous.double().numpy() * self.reach_m, action.choice.numpy())
+
+
+def load_agent(checkpoint: Checkpoint, path: Path) -> Agent:
+    """The agent of a checkpoint, weights only.
+
+    Raises:
+        CheckpointError: its configuration or weights are not of this version's agents.
+    """
+    try:
+        config = TypeAdapter[Any](AnyConfig).validate_python(checkpoint.document["config"])
+        spaces = Spaces.model_validate(checkpoint.document["spaces"])
+    except (KeyError, ValidationError):
+        raise CheckpointError(f"checkpoint '{path}' holds no agent of this version of uavrl") from None
+    agent = make_agent(spaces, config)
+    restore_networks(agent, checkpoint.tensors["networks"])
+    return agent
+
+
+def load_policy(path: Path, scenario: Scenario, candidates: int | None = None) -> AgentPolicy:
+    """The policy of a run's directory or of a checkpoint's, for `scenario`.
+
+    Raises:
+        CheckpointError: missing or damaged; or a perceptron trained with another number of devices.
+    """
+    path = Path(path)
+    place = path / "checkpoint" if (path / "checkpoint").is_dir() else path
+    checkpoint = load_checkpoint(place)
+    agent = load_agent(checkpoint, place)
+    devices, trained = scenario.traffic.devices, agent.spaces.choices - 1
+    if agent.spaces.observation is not None and devices != trained:
+        raise CheckpointError(
+            f"checkpoint '{path}' is a perceptron for devices = {trained}, the scenario has {devices}"
+        )
+    if candidates is not None and hasattr(agent.config, "candidates"):
+        agent.config = agent.config.model_copy(update={"candidates": candidates})
+    name = str(checkpoint.document.get("agent", place.name))
+    return AgentPolicy(name, agent, scenario)
+
+
+def trained_scenario(path: Path) -> Scenario:
+    """The scenario that a checkpoint was trained in."""
+    path = Path(path)
+    place = path / "checkpoint" if (path / "checkpoint").is_dir() else path
+    return parse_scenario(load_checkpoint(place).document["scenario"])
