@@ -58,7 +58,7 @@ class EvaluationSet:
         return self.episodes * self.fading_seeds
 
     def draws(self, block: int, wanted: Bool) -> Draws:
-        """Randomness of 64 steps from step 64 `block`: scatter (64, N, 2), sight (64, N); 1, 0 where not `wanted` (N,)."""
+        """Randomness of 64 steps from step 64 `block`: scatter (64, N, 2), sight (64, N); 1 and 0 unless `wanted`."""
         scatter, sight = np.ones((_BLOCK, self.flights, 2)), np.zeros((_BLOCK, self.flights))
         for flight in np.flatnonzero(wanted):
             episode, repeat = divmod(int(flight), self.fading_seeds)
