@@ -25,7 +25,7 @@ def resolve(spec: str, scenario: Scenario) -> Policy:
     if spec in POLICIES:
         return make_policy(spec)
     if Path(spec).is_dir():
-        from uavrl.training.checkpoint import load_policy  # here: torch is slow to import
+        from uavrl.training.policy import load_policy  # here: torch is slow to import
 
         policy: Policy = load_policy(Path(spec), scenario)
         return policy

@@ -17,6 +17,7 @@ from uavrl.agents.base import Batch
 from uavrl.agents.registry import OfflineConfig, make_agent
 from uavrl.datasets.transitions import Transitions
 from uavrl.errors import CheckpointError, ConfigError, DivergenceError
+from uavrl.evaluation.rollouts import EVALUATION_SEED
 from uavrl.networks import Observation, fit_normalisers
 from uavrl.scenario import Scenario
 from uavrl.training.batches import OBSERVATION_OF, reward_transform, spaces_of, to_batch, transformed
@@ -26,6 +27,8 @@ from uavrl.training.policy import AgentPolicy
 
 Evaluator = Callable[[AgentPolicy], dict[str, float]]
 
+PRESET_UPDATES = {"default": 60_000, "paper": 70_000}  # the paper: J = 150 passes over 30 k rows in batches of 64
+
 
 class TrainConfig(BaseModel):
     """A run of offline learning, all but its data."""
@@ -34,9 +37,9 @@ class TrainConfig(BaseModel):
 
     scenario: Scenario
     agent: OfflineConfig
-    updates: int = Field(60_000, ge=1, description="gradient steps")
+    updates: int = Field(PRESET_UPDATES["default"], ge=1, description="gradient steps")
     decay: Literal["none", "cosine"] = Field("cosine", description="learning rate over the run: constant, or to 0")
-    seed: int = Field(0, ge=0, lt=1_000_000, description="of weights, data order and noise")
+    seed: int = Field(0, ge=0, lt=EVALUATION_SEED, description="of weights, data order and noise")
     log_every: int = Field(200, ge=1, description="updates between rows of metrics.jsonl")
     save_every: int = Field(5_000, ge=1, description="updates between checkpoints")
     evaluate_every: int = Field(0, ge=0, description="updates between trial flights; 0: none")

@@ -17,6 +17,7 @@ from uavrl.agents.sac import Sac, SacConfig
 from uavrl.datasets.replay import ReplayLog
 from uavrl.datasets.transitions import Transitions, transition_columns
 from uavrl.errors import CheckpointError, ConfigError, DivergenceError
+from uavrl.evaluation.rollouts import EVALUATION_SEED, fixed_layout
 from uavrl.networks import fit_normalisers
 from uavrl.scenario import Scenario, parse_scenario
 from uavrl.simulation.environment import DataCollectionVectorEnv
@@ -33,10 +34,6 @@ from uavrl.training.checkpoint import (
 )
 from uavrl.training.log import MetricsLog, Reporter
 
-EVALUATION_SEEDS = 1_000_000  # layouts and seeds from here on are for evaluation and never occur in training
-
-FIXED_LAYOUT = np.random.default_rng(0).uniform(0, 1000, (10, 2))
-
 
 class CollectConfig(BaseModel):
     """A run of online learning."""
@@ -51,7 +48,7 @@ class CollectConfig(BaseModel):
     random_steps: int = Field(10_000, ge=0, description="steps of uniformly random actions at the start")
     steps_per_update: int = Field(8, ge=1, description="environment steps for each gradient step")
     centre_every: int = Field(500, ge=1, description="updates between re-centrings of the reward")
-    seed: int = Field(0, ge=0, lt=EVALUATION_SEEDS, description="of layouts, starts, fading, exploration and weights")
+    seed: int = Field(0, ge=0, lt=EVALUATION_SEED, description="of layouts, starts, fading, exploration and weights")
 
 
 class OnlineLearner:
@@ -64,10 +61,6 @@ class OnlineLearner:
     def __init__(self, config: CollectConfig) -> None:
         self.config = config
         scenario = config.scenario
-        if config.layouts == "fixed" and scenario.traffic.devices != len(FIXED_LAYOUT):
-            raise ConfigError(
-                f"layouts = 'fixed' has {len(FIXED_LAYOUT)} devices, devices = {scenario.traffic.devices}"
-            )
         if scenario.limits.max_steps is None:
             raise ConfigError("limits.max_steps is none, collecting needs a number of steps to size its log")
         self.kind = OBSERVATION_OF[config.agent.network.kind]
@@ -76,7 +69,7 @@ class OnlineLearner:
             num_envs=config.environments,
             vectorization_mode="vector_entry_point",
             scenario=scenario,
-            layout=FIXED_LAYOUT if config.layouts == "fixed" else None,
+            layout=fixed_layout(scenario) if config.layouts == "fixed" else None,
             observation=self.kind,
         )
         if not isinstance(environment.unwrapped, DataCollectionVectorEnv):

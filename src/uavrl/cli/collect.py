@@ -1,0 +1,72 @@
+"""`uavrl collect`."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from uavrl.cli.settings import pydantic_config, with_settings
+from uavrl.errors import ConfigError
+from uavrl.scenario import load_scenario
+
+Many = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+
+
+@dataclass(frozen=True)
+class Collect:
+    """Let hybrid SAC learn online in the simulator and log all of its flights. Interrupted, it goes on where it was."""
+
+    out: Path
+    """directory of the run: checkpoint, metrics.jsonl and, at the end, flights.parquet"""
+    layouts: Literal["fixed", "random"] = "fixed"
+    """one layout throughout, or a new one each episode"""
+    scenario: str = "released"
+    """a preset (paper, released, realistic) or a TOML file"""
+    network: Literal["devices", "mlp"] = "devices"
+    """a network over the set of devices, or the paper's perceptron on its K + 3 entries"""
+    episodes: int = 700
+    """flights to log"""
+    seed: int = 0
+    """of layouts, starts, fading, exploration and weights; below 1,000,000"""
+    set: Many = ()
+    """a setting of the learner as name=value, such as discount=0.99; repeat it for more"""
+    minari: str | None = None
+    """id of the Minari dataset to write at the end, such as uavrl/fixed-v0"""
+
+    def run(self) -> None:
+        from uavrl.agents.sac import SacConfig
+        from uavrl.datasets import save_flat, write_minari
+        from uavrl.networks import NetworkConfig
+        from uavrl.training.log import progress
+        from uavrl.training.online import CollectConfig, OnlineLearner, same_run
+
+        width = 256 if self.network == "mlp" else 64
+        agent = SacConfig(network=NetworkConfig(kind=self.network, width=width))
+        config = pydantic_config(
+            CollectConfig,
+            scenario=load_scenario(self.scenario),
+            layouts=self.layouts,
+            agent=with_settings(agent, self.set),
+            episodes=self.episodes,
+            seed=self.seed,
+        )
+        learner = OnlineLearner.resume(self.out)
+        if learner is None:
+            learner = OnlineLearner(config)
+        elif not same_run(self.out, config):
+            raise ConfigError(f"--out '{self.out}' holds a run of other settings; give another directory")
+        else:
+            print(f"going on from step {len(learner.log):,}", file=sys.stderr)
+        limit = config.scenario.limits.max_steps or 0
+        with progress("collect", config.episodes * limit, "step") as report:
+            transitions = learner.run(self.out, report)
+        save_flat(self.out / "flights.parquet", transitions, config.scenario)
+        print(f"{self.out / 'flights.parquet'}: {transitions!r}")
+        if self.minari is not None:
+            write_minari(self.minari, transitions, config.scenario, learner.kind)
+            print(f"Minari dataset {self.minari}")
+        print(f"next: uavrl data show {self.out / 'flights.parquet'}")

@@ -1,0 +1,55 @@
+"""Pydantic configurations from what a user typed; `--set name=value` reaches any nested setting."""
+
+from __future__ import annotations
+
+import json
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from uavrl.errors import ConfigError
+from uavrl.scenario import describe_validation
+
+Config = TypeVar("Config", bound=BaseModel)
+
+
+def with_settings(config: Config, settings: tuple[str, ...]) -> Config:
+    """The configuration with `bc_weight=0.3`, `diffusion.steps=10` and the like applied.
+
+    Raises:
+        ConfigError: no `=`, no such setting, or a value that it does not allow.
+    """
+    data = config.model_dump()
+    for setting in settings:
+        name, equals, text = setting.partition("=")
+        if not equals:
+            raise ConfigError(f"--set {setting!r}, allowed: name=value, such as bc_weight=0.3")
+        *sections, leaf = name.split(".")
+        place: Any = data
+        for section in sections:
+            place = place.get(section) if isinstance(place, dict) else None
+        if not isinstance(place, dict) or leaf not in place or leaf == "name":
+            known = ", ".join(key for key in (place if isinstance(place, dict) else data) if key != "name")
+            raise ConfigError(f"setting '{name}' does not exist, allowed: {known}")
+        place[leaf] = _value(text)
+    return pydantic_config(type(config), **data)
+
+
+def _value(text: str) -> Any:
+    """JSON where it is JSON (numbers, true, null), else the text itself."""
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
+
+
+def pydantic_config(kind: type[Config], **values: Any) -> Config:
+    """A configuration from what a user typed.
+
+    Raises:
+        ConfigError: one line naming the setting, its value and what is allowed.
+    """
+    try:
+        return kind(**values)
+    except ValidationError as error:
+        raise ConfigError(describe_validation(error, "setting")) from None

@@ -1,0 +1,114 @@
+"""`uavrl train`."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+import tyro
+
+from uavrl.cli.settings import pydantic_config, with_settings
+from uavrl.errors import ConfigError
+from uavrl.scenario import Scenario
+
+if TYPE_CHECKING:
+    from uavrl.datasets import Transitions
+    from uavrl.training.offline import Evaluator
+
+Many = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+
+TRIAL_SEED = 500_000  # trial flights during training: neither the data's seeds nor the evaluation's
+
+
+@dataclass(frozen=True)
+class Train:
+    """Learn a policy from logged flights alone. Interrupted, it goes on where it was with --resume."""
+
+    agent: tyro.conf.Positional[Literal["diffusion_sac", "bc"]]
+    """algorithm"""
+    out: Path
+    """directory of the run: checkpoint and metrics.jsonl"""
+    data: str = "layouts"
+    """layouts or fixed (built in), or a .parquet or .npz file, or the id of a Minari dataset"""
+    size: int | None = None
+    """transitions to learn from; by default 30,000 of a built-in data set, all of a file"""
+    quality: Literal["mixed", "good", "bad"] = "mixed"
+    """part of the log that --size draws from: all, the last third, the first third"""
+    data_seed: int = 0
+    """of the draw"""
+    scenario: str | None = None
+    """preset or TOML file; by default the one that the data carry"""
+    preset: Literal["default", "paper"] = "default"
+    """the settings that we recommend (about an hour on one core), or the paper's as printed"""
+    updates: int | None = None
+    """gradient steps; by default what the preset says"""
+    seed: int = 0
+    """of weights, data order and noise"""
+    set: Many = ()
+    """a setting as name=value, such as bc_weight=0.3 or diffusion.steps=10; repeat it for more"""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """where to compute"""
+    evaluate_every: int = 0
+    """updates between trial flights on 20 layouts of their own; 0: none"""
+    resume: bool = False
+    """go on from the checkpoint in --out"""
+
+    def run(self) -> None:
+        from uavrl.agents.registry import preset
+        from uavrl.datasets import load_source, select
+        from uavrl.training.log import progress
+        from uavrl.training.offline import PRESET_UPDATES, OfflineLearner, TrainConfig
+
+        transitions, scenario = load_source(self.data, self.scenario)
+        size = self.size if self.size is not None else (30_000 if self.data in ("fixed", "layouts") else None)
+        if size is not None:
+            transitions = select(transitions, size, self.quality, self.data_seed)
+        elif self.quality != "mixed":
+            raise ConfigError(f"--quality {self.quality} needs --size")
+        config = pydantic_config(
+            TrainConfig,
+            scenario=scenario,
+            agent=with_settings(preset(self.agent, self.preset), self.set),
+            updates=PRESET_UPDATES[self.preset] if self.updates is None else self.updates,
+            seed=self.seed,
+            evaluate_every=self.evaluate_every,
+        )
+        learner = OfflineLearner.resume(self.out, transitions, self.device) if self.resume else None
+        if self.resume and learner is None:
+            raise ConfigError(f"--resume: '{self.out}' holds no checkpoint")
+        if learner is None:
+            if (self.out / "checkpoint").exists():
+                raise ConfigError(f"--out '{self.out}' holds a run already; give --resume or another directory")
+            learner = OfflineLearner(config, transitions, self.device)
+        elif learner.config != config:
+            raise ConfigError(f"--resume: '{self.out}' was started with other settings; give the same ones")
+        else:
+            print(f"going on from update {learner.updates:,}", file=sys.stderr)
+        trial = trial_flights(transitions, scenario) if self.evaluate_every else None
+        with progress(f"train {self.agent}", config.updates, "update") as report:
+            learner.run(self.out, report, trial)
+        print(f"{learner.updates:,} updates on {len(transitions):,} transitions; policy in {self.out}")
+        print(f"next: uavrl evaluate --policy tdm --policy {self.out} --scenario {scenario.name}")
+
+
+def trial_flights(transitions: Transitions, scenario: Scenario, episodes: int = 20) -> Evaluator:
+    """Flies a policy on trial layouts: the data's own where they hold a single one, else new ones."""
+    from dataclasses import replace
+
+    from uavrl.evaluation.rollouts import evaluation_set, fly
+    from uavrl.training.policy import AgentPolicy
+
+    environments = evaluation_set(scenario, "random", episodes, seed=TRIAL_SEED)
+    layouts = np.unique(transitions.layout_m, axis=0)
+    if len(layouts) == 1:
+        environments = replace(environments, layout_m=np.repeat(layouts.astype(np.float64), episodes, axis=0))
+
+    def evaluate(policy: AgentPolicy) -> dict[str, float]:
+        flown = fly(policy, environments)
+        returns = (flown.reward * flown.active).sum(axis=0)
+        return {"return": float(returns.mean()), "return_median": float(np.median(returns))}
+
+    return evaluate
