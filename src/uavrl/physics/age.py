@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from array_api_compat import array_namespace
-
-Array = Any  # a NumPy array or torch tensor; the Array API has no common type to name
+from uavrl.physics.arrays import Array, array_namespace
 
 
 def next_age_s(age_s: Array, served: Array, duration_s: Array, max_age_s: float) -> Array:
@@ -18,13 +14,12 @@ def next_age_s(age_s: Array, served: Array, duration_s: Array, max_age_s: float)
         duration_s: (N,) T_total.
     """
     xp = array_namespace(age_s)
-    grown = xp.clip(age_s + duration_s[:, None], 0.0, max_age_s)
-    return xp.where(served, xp.zeros_like(grown), grown)
+    return xp.where(served, 0.0, xp.minimum(age_s + duration_s[:, None], max_age_s))
 
 
 def age_integral_s2(age_s: Array, duration_s: Array, max_age_s: float) -> Array:
     """Integral of min(A_max, A + t) over a step, A tau + tau^2/2 less what is clipped (N, K) (s^2)."""
     xp = array_namespace(age_s)
     tau = duration_s[:, None]
-    over = xp.clip(age_s + tau - max_age_s, 0.0, None)
+    over = xp.maximum(age_s + tau - max_age_s, 0.0)
     return age_s * tau + 0.5 * tau * tau - 0.5 * over * over

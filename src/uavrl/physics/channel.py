@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from array_api_compat import array_namespace
 
+from uavrl.physics.arrays import Array, array_namespace
 from uavrl.scenario import Channel
-
-Array = Any  # a NumPy array or torch tensor; the Array API has no common type to name
 
 # (a, b, eta_LoS dB, eta_NLoS dB) of Al-Hourani, Kandeepan & Lardner 2014, "Optimal LAP altitude for maximum coverage"
 AL_HOURANI = {
@@ -93,6 +90,11 @@ def fading_power(normal: Array, factor: Array) -> Array:
     real = xp.sqrt(factor / (factor + 1.0)) + scatter * normal[..., 0]
     imaginary = scatter * normal[..., 1]
     return real * real + imaginary * imaginary
+
+
+def rayleigh_power(normal: Array) -> Array:
+    """|h|^2 of Rayleigh fading, exponential with unit mean: `fading_power` with factor 0; arguments as there."""
+    return 0.5 * (normal[..., 0] * normal[..., 0] + normal[..., 1] * normal[..., 1])
 
 
 def rate_bps(snr: Array, bandwidth_hz: float) -> Array:
@@ -201,7 +203,7 @@ def expected_service(horizontal_m: Array, packet_bits: Array, channel: Channel) 
     if limit_s is None or channel.fading in ("none", "ergodic"):
         seconds = transmission_s(packet_bits, _mean_rate_bps(snr, los, factor, channel))
         limit = math.inf if limit_s is None else limit_s
-        return xp.clip(seconds, 0.0, limit), xp.astype(seconds <= limit, seconds.dtype)
+        return xp.clip(seconds, 0.0, limit), xp.where(seconds <= limit, xp.ones_like(seconds), 0.0)
     unit_s = packet_bits / channel.bandwidth_hz
     seconds, arrival = _limited_service(unit_s, snr, xp.zeros_like(snr), limit_s)
     if channel.fading == "rician":

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
+from uavrl.physics.arrays import Array
 from uavrl.scenario import Airframe
-
-Array = Any  # a NumPy array or torch tensor; the Array API has no common type to name
 
 
 def hover_power_w(airframe: Airframe) -> float:

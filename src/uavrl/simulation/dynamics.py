@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from array_api_compat import array_namespace
-
 from uavrl.physics import age, channel, energy
+from uavrl.physics.arrays import Array, array_namespace, length
 from uavrl.scenario import Area, Scenario, hover_reference_j
 from uavrl.simulation.state import Draws, FlightAction, Outcome, SimState
-
-Array = Any  # a NumPy array or torch tensor; the Array API has no common type to name
 
 
 def initial_state(position_m: Array, devices: int) -> SimState:
@@ -26,31 +21,30 @@ def initial_state(position_m: Array, devices: int) -> SimState:
 def _fly(position_m: Array, displacement_m: Array, d_max: float, area: Area) -> Array:
     """Position after a move of at most d_max under the scenario's border rule (N, 2) (m)."""
     xp = array_namespace(position_m)
-    length = xp.sqrt(xp.sum(displacement_m * displacement_m, axis=1))
-    scale = d_max / xp.clip(length, d_max, None)
+    scale = d_max / xp.maximum(length(displacement_m), d_max)
     target = position_m + displacement_m * scale[:, None]
     size = xp.asarray([area.width_m, area.depth_m], dtype=position_m.dtype, device=position_m.device)
-    if area.border == "reflect":
-        return size - xp.abs(xp.remainder(target, 2.0 * size) - size)
-    clipped = xp.clip(target, xp.zeros_like(size), size)
+    clipped = xp.minimum(xp.maximum(target, 0.0), size)
     if area.border == "clip":
         return clipped
-    inside = xp.all(clipped == target, axis=1)  # "mirroring" in the paper: the move is cancelled at no cost
-    return xp.where(inside[:, None], target, position_m)
+    inside = clipped == target
+    if area.border == "reflect":
+        return xp.where(inside, target, size - xp.abs(xp.remainder(target, 2.0 * size) - size))
+    inside = inside[:, :1] & inside[:, 1:]  # "mirroring" in the paper: the whole move is cancelled at no cost
+    return xp.where(inside, target, position_m)
 
 
 def _transmit(
     scenario: Scenario, layout_m: Array, position_m: Array, device: Array, draws: Draws
 ) -> tuple[Array, Array, Array]:
-    """(snr, rate in bit/s, packet in bits) of the wanted link, each (N,); an idle row's values mean nothing."""
+    """(snr, rate in bit/s, packet in bits) of the wanted link, (N,) or one number; idle rows mean nothing."""
     xp = array_namespace(position_m)
-    index = xp.clip(device - 1, 0, None)
-    where = xp.take_along_axis(layout_m, xp.broadcast_to(index[:, None, None], (index.shape[0], 1, 2)), axis=1)[:, 0]
-    offset = where - position_m
+    index = xp.maximum(device - 1, 0)
+    rows = xp.arange(index.shape[0], device=index.device)
     link = scenario.channel
-    elevation, los, snr = channel.link_snr(xp.sqrt(xp.sum(offset * offset, axis=1)), link)
+    elevation, los, snr = channel.link_snr(length(layout_m[rows, index] - position_m), link)
     if link.fading == "rayleigh":
-        snr = snr * channel.fading_power(draws.scatter, xp.zeros_like(snr))
+        snr = snr * channel.rayleigh_power(draws.scatter)
     elif link.fading == "rician":
         factor = xp.where(draws.sight < los, channel.rician_factor(elevation, link), xp.zeros_like(snr))
         snr = snr * channel.fading_power(draws.scatter, factor)
@@ -60,8 +54,8 @@ def _transmit(
         rate = channel.rate_bps(snr, link.bandwidth_hz)
     bits = scenario.traffic.packet_bits
     if isinstance(bits, tuple):
-        return snr, rate, xp.take(xp.asarray(bits, dtype=snr.dtype, device=snr.device), index, axis=0)
-    return snr, rate, xp.full_like(snr, bits)
+        bits = xp.asarray(bits, dtype=snr.dtype, device=snr.device)[index]
+    return snr, rate, bits
 
 
 def age_term(scenario: Scenario, age_s: Array, next_age_s: Array, duration_s: Array) -> Array:
@@ -72,10 +66,10 @@ def age_term(scenario: Scenario, age_s: Array, next_age_s: Array, duration_s: Ar
     if objective.reward == "per_second":
         cost = age.age_integral_s2(age_s, duration_s, traffic.max_age_s)
     if traffic.priority is None:
-        weighted = xp.mean(cost, axis=1)
+        weight = xp.full((traffic.devices,), 1.0 / traffic.devices, dtype=cost.dtype, device=cost.device)
     else:
-        weighted = xp.sum(cost * xp.asarray(traffic.priority, dtype=cost.dtype, device=cost.device), axis=1)
-    return weighted / objective.age_reference_s
+        weight = xp.asarray(traffic.priority, dtype=cost.dtype, device=cost.device)
+    return cost @ weight / objective.age_reference_s
 
 
 def advance(
@@ -105,31 +99,32 @@ def advance(
 
     position = _fly(state.position_m, action.displacement_m, frame.max_displacement_m, scenario.area)
     moved = position - state.position_m
-    move_s = xp.sqrt(xp.sum(moved * moved, axis=1)) / frame.speed_mps
+    move_s = length(moved) / frame.speed_mps
 
     wants = action.device > 0
     snr, rate, bits = _transmit(scenario, layout_m, position, action.device, draws)
     transmission_s = channel.transmission_s(bits, rate)
     limit_s = scenario.channel.max_transmission_s
-    outage = zero > 1.0
+    never = xp.zeros_like(wants)
+    outage = never
     if limit_s is not None:
         outage = wants & (transmission_s > limit_s)
-        transmission_s = xp.clip(transmission_s, 0.0, limit_s)
+        transmission_s = xp.minimum(transmission_s, limit_s)
     transmission_s = xp.where(wants, transmission_s, zero)
     arrived = wants & ~outage
 
-    decide_s = zero + frame.decision_s if decision_s is None or frame.decision_time == "fixed" else decision_s
-    duration_s = move_s + transmission_s + decide_s  # eq. (time_total)
+    idle_s = zero + frame.decision_s if decision_s is None or frame.decision_time == "fixed" else decision_s
     if frame.min_idle_s > 0:
-        duration_s = xp.where(wants, duration_s, xp.clip(duration_s, frame.min_idle_s, None))
+        idle_s = xp.where(wants, idle_s, xp.maximum(idle_s, frame.min_idle_s - move_s))
+    duration_s = move_s + transmission_s + idle_s  # eq. (time_total)
 
     move_j = energy.move_energy_j(move_s, frame)
     communication_j = energy.communication_energy_j(transmission_s, frame)
-    idle_j = energy.idle_energy_j(duration_s - move_s - transmission_s, frame)
+    idle_j = energy.idle_energy_j(idle_s, frame)
     total_j = move_j + communication_j + idle_j  # eq. (energy_total)
 
     devices = xp.arange(1, layout_m.shape[1] + 1, dtype=action.device.dtype, device=action.device.device)
-    reset = arrived[:, None] & (action.device[:, None] == devices)
+    reset = xp.where(arrived, action.device, 0)[:, None] == devices
     ages = age.next_age_s(state.age_s, reset, duration_s, traffic.max_age_s)
     age_cost = age_term(scenario, state.age_s, ages, duration_s)
     energy_term = total_j / hover_reference_j(scenario, energy.hover_power_w(frame))
@@ -143,8 +138,8 @@ def advance(
         time_s=state.time_s + duration_s,
         step=state.step + 1,
     )
-    terminated = outage & False if limits.energy_budget_j is None else after.used_j > limits.energy_budget_j
-    truncated = outage & False
+    terminated = never if limits.energy_budget_j is None else after.used_j > limits.energy_budget_j
+    truncated = never
     if limits.max_steps is not None:
         truncated = truncated | (after.step >= limits.max_steps)
     if limits.time_budget_s is not None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
-from array_api_compat import array_namespace
-
+from uavrl.physics.arrays import Array, array_namespace
 from uavrl.scenario import Scenario
 
-Array = Any  # a NumPy array or torch tensor; the Array API has no common type to name
 ObservationKind = Literal["paper", "devices"]
 
 UAV_ENTRIES = ("x_m", "y_m", "energy_j", "energy_left")
@@ -34,7 +32,7 @@ def devices_observation(
     """The set observation of N environments; arguments as in SimState, layout_m (N, K, 2)."""
     xp = array_namespace(position_m)
     budget = scenario.limits.energy_budget_j
-    left = xp.ones_like(energy_j) if budget is None else xp.clip(1.0 - used_j / budget, 0.0, None)
+    left = xp.ones_like(energy_j) if budget is None else xp.maximum(1.0 - used_j / budget, 0.0)
     uav = xp.concat([position_m, energy_j[:, None], left[:, None]], axis=1)
     count = age_s.shape[1]
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-Array = Any  # a NumPy array or torch tensor; the Array API has no common type to name
+from uavrl.physics.arrays import Array
 
 
 class FlightAction(NamedTuple):
