@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, TypeVar
 
 import gymnasium
 import numpy as np
@@ -27,6 +28,8 @@ Observation = Any  # (N, K+3) array, or a dict of arrays, as the observation spa
 
 _LARGEST = float(np.finfo(np.float32).max)
 
+_Rows = TypeVar("_Rows", SimState, Outcome)
+
 
 def check_layout(layout: ArrayLike, scenario: Scenario) -> Float:
     """Device positions as a (K, 2) float64 array (m).
@@ -38,10 +41,7 @@ def check_layout(layout: ArrayLike, scenario: Scenario) -> Float:
 
 
 def _check_positions(values: ArrayLike, shape: tuple[int, ...], what: str, scenario: Scenario) -> Float:
-    try:
-        array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ScenarioError(f"{what} is no array of numbers, allowed: shape {shape} in metres") from None
+    array = _numbers(values, what)
     if array.shape != shape:
         raise ScenarioError(f"{what} has shape {array.shape}, allowed: {shape} (x, y in metres)")
     size = np.array([scenario.area.width_m, scenario.area.depth_m])
@@ -50,6 +50,37 @@ def _check_positions(values: ArrayLike, shape: tuple[int, ...], what: str, scena
         index = tuple(int(i) for i in np.argwhere(bad)[0])
         raise ScenarioError(f"{what}{list(index)} = {array[index]:g} lies outside the area 0..{size[index[-1]]:g} m")
     return array
+
+
+def _numbers(values: ArrayLike, what: str) -> Float:
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ScenarioError(f"{what} is no array of numbers, allowed: x and y in metres") from None
+
+
+def check_action(action: Mapping[str, Any], lead: tuple[int, ...], scenario: Scenario) -> FlightAction:
+    """The action as float64 (..., 2) and int64 (...) arrays, `lead` being the leading shape.
+
+    Raises:
+        ScenarioError: wrong shape, a displacement that is not finite, or a device that does not exist.
+    """
+    displacement_m, device = _numbers(action["displacement_m"], "displacement_m"), np.asarray(action["device"])
+    count = scenario.traffic.devices
+    for what, array, shape in (("displacement_m", displacement_m, (*lead, 2)), ("device", device, lead)):
+        if array.shape != shape:
+            raise ScenarioError(f"{what} has shape {array.shape}, allowed: {shape}")
+    if not np.isfinite(displacement_m).all():
+        raise ScenarioError(f"displacement_m = {_worst(displacement_m, ~np.isfinite(displacement_m))}, allowed: metres")
+    if device.dtype.kind not in "iu":
+        raise ScenarioError(f"device is of type {device.dtype}, allowed: integers, 0 (idle) to {count}")
+    if device.min() < 0 or device.max() > count:
+        raise ScenarioError(f"device = {_worst(device, (device < 0) | (device > count))}, allowed: 0 (idle) to {count}")
+    return FlightAction(displacement_m, device.astype(np.int64, copy=False))
+
+
+def _worst(array: NDArray[Any], bad: NDArray[np.bool_]) -> str:
+    return f"{array[bad].flat[0]:g}"
 
 
 def random_positions(generator: np.random.Generator, shape: tuple[int, ...], scenario: Scenario) -> Float:
@@ -106,8 +137,7 @@ def action_space(scenario: Scenario) -> spaces.Dict:
 
 def outcome_info(state: SimState, outcome: Outcome, layout_m: Float) -> dict[str, Any]:
     """The `info` of a step, batched: every field of the outcome, ages, positions and clocks."""
-    info = {name: getattr(outcome, name) for name in outcome.__dataclass_fields__}
-    info |= {"age_s": state.age_s, "position_m": state.position_m, "layout_m": layout_m}
+    info = vars(outcome) | {"age_s": state.age_s, "position_m": state.position_m, "layout_m": layout_m}
     return info | {"time_s": state.time_s, "step": state.step, "step_s": outcome.duration_s}
 
 
@@ -151,12 +181,12 @@ class DataCollectionVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self._done = np.zeros(num_envs, dtype=bool)
 
     def _layouts(self, layout: ArrayLike) -> Float:
-        array = np.asarray(layout, dtype=np.float64)
+        array = _numbers(layout, "layout")
         if array.ndim == 3:
             if len(array) != self.num_envs:
                 raise ScenarioError(f"layout has shape {array.shape}, allowed: (K, 2) or ({self.num_envs}, K, 2)")
             return np.stack([check_layout(one, self.scenario) for one in array])
-        one = check_layout(layout, self.scenario)
+        one = check_layout(array, self.scenario)
         return np.broadcast_to(one, (self.num_envs, *one.shape)).copy()
 
     def _restart(self, mask: NDArray[np.bool_], options: dict[str, Any] | None) -> None:
@@ -173,18 +203,11 @@ class DataCollectionVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         elif self._fixed_layout is not None:
             layout = self._fixed_layout
         if options.get("position_m") is not None:
-            wanted = np.asarray(options["position_m"])
+            wanted = _numbers(options["position_m"], "position_m")
             shape = (count, 2) if wanted.ndim > 1 else (2,)
             position = np.broadcast_to(_check_positions(wanted, shape, "position_m", self.scenario), (count, 2))
-        fresh = initial_state(position, devices)
-        row = mask[:, None]
-        self.layout_m = np.where(row[:, :, None], layout, self.layout_m)
-        self.state = SimState(
-            **{
-                name: np.where(row if getattr(fresh, name).ndim == 2 else mask, getattr(fresh, name), value)
-                for name, value in vars(self.state).items()
-            }
-        )
+        self.layout_m = np.where(mask[:, None, None], layout, self.layout_m)
+        self.state = _rows(mask, initial_state(position, devices), self.state)
         self._done = self._done & ~mask
 
     def reset(self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None) -> Any:
@@ -205,23 +228,28 @@ class DataCollectionVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self.state, self.layout_m, self._done = state, layout_m, done
 
     def step(self, actions: dict[str, Any]) -> Any:
-        """Advance N environments; those that ended in the step before are reset instead (reward 0)."""
-        action = FlightAction(
-            np.asarray(actions["displacement_m"], dtype=np.float64), np.asarray(actions["device"], dtype=np.int64)
-        )
+        """Advance N environments; those that ended in the step before are reset instead, their outcome all 0."""
+        return self._advance(check_action(actions, (self.num_envs,), self.scenario))
+
+    def _advance(self, action: FlightAction) -> Any:
         before = self._done
         state, outcome = advance(self.scenario, self.layout_m, self.state, action, draw(self.np_random, self.num_envs))
         self.state = state
-        reward, terminated, truncated = outcome.reward, outcome.terminated, outcome.truncated
-        info = outcome_info(state, outcome, self.layout_m)
         if before.any():
             self._restart(before, None)
-            reward = np.where(before, 0.0, reward)
-            terminated, truncated = terminated & ~before, truncated & ~before
-            info |= {"age_s": self.state.age_s, "position_m": self.state.position_m, "layout_m": self.layout_m}
-            info |= {"time_s": self.state.time_s, "step": self.state.step}
-        self._done = terminated | truncated
-        return self.observation(), reward, terminated, truncated, info
+            outcome = _rows(before, Outcome(**{k: np.zeros_like(v) for k, v in vars(outcome).items()}), outcome)
+        self._done = outcome.terminated | outcome.truncated
+        info = outcome_info(self.state, outcome, self.layout_m)
+        return self.observation(), outcome.reward, outcome.terminated, outcome.truncated, info
+
+
+def _rows(mask: NDArray[np.bool_], chosen: _Rows, other: _Rows) -> _Rows:
+    """The rows of `chosen` where `mask` (N,), else those of `other`."""
+    merged = {
+        name: np.where(mask[:, None] if value.ndim == 2 else mask, getattr(chosen, name), value)
+        for name, value in vars(other).items()
+    }
+    return type(other)(**merged)
 
 
 class DataCollectionEnv(gymnasium.Env[Any, Any]):
@@ -271,18 +299,13 @@ class DataCollectionEnv(gymnasium.Env[Any, Any]):
 
     def step(self, action: dict[str, Any]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Fly and serve once."""
-        wanted = np.asarray(action["displacement_m"], dtype=np.float64)
-        device = int(action["device"])
-        if wanted.shape != (2,) or not np.isfinite(wanted).all():
-            raise ScenarioError(f"displacement_m = {wanted.tolist()}, allowed: two finite numbers in metres")
-        if not 0 <= device <= self.scenario.traffic.devices:
-            raise ScenarioError(f"device = {device}, allowed: 0 (idle) to {self.scenario.traffic.devices}")
+        wanted = check_action(action, (), self.scenario)
         self._one._done[:] = False  # only a reset starts a new episode here
-        observation, reward, terminated, truncated, info = self._one.step(
-            {"displacement_m": wanted[None], "device": np.array([device])}
+        observation, reward, terminated, truncated, info = self._one._advance(
+            FlightAction(wanted.displacement_m[None], wanted.device[None])
         )
         self._path_m.append(self.state.position_m[0])
-        self._served = device
+        self._served = int(wanted.device)
         return _first(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), _first(info)
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -300,6 +323,5 @@ class DataCollectionEnv(gymnasium.Env[Any, Any]):
 def _first(batch: Any) -> Any:
     """Row 0 of a batched observation or info; numbers become Python's own."""
     if isinstance(batch, dict):
-        return {key: _first(value) for key, value in batch.items()}
-    row = batch[0]
-    return row.copy() if row.ndim else row.item()
+        return {key: value.item() if value.ndim == 1 else value[0].copy() for key, value in batch.items()}
+    return batch[0].copy()
