@@ -31,9 +31,12 @@ def test_every_field_has_its_description_and_range_above_it() -> None:
     for leaf in Scenario().flat():
         row = next(i for i, line in enumerate(lines) if line.startswith(f"{leaf.split('.')[1]} = "))
         assert lines[row - 1].startswith("# ")
-    assert "# lambda, weight of age against energy; number >= 0 and <= 1" in lines
-    assert '# truncated at this many steps; whole number >= 1 or "none"' in lines
-    assert any(line.endswith('one of "none", "rayleigh", "rician", "ergodic"') for line in lines)
+    above = {line.split(" = ")[0]: lines[row - 1] for row, line in enumerate(lines)}
+    assert above["age_weight"].endswith("; number >= 0 and <= 1")
+    assert above["max_steps"].endswith('; whole number >= 1 or "none"')
+    assert above["fading"].endswith('; one of "none", "rayleigh", "rician", "ergodic"')
+    assert above["charge_idle_hover"].endswith("; true or false")
+    assert above["packet_bits"].endswith("; number > 0 or a list of number > 0")
 
 
 def test_diff_lists_exactly_what_differs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

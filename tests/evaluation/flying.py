@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from uavrl.evaluation.rollouts import EvaluationSet
 from uavrl.physics.channel import link_snr, rate_bps
@@ -75,9 +74,3 @@ def overhead(scenario: Scenario, episodes: int = 1) -> EvaluationSet:
         seed=1_000_000,
         fading_seeds=1,
     )
-
-
-def mean_and_limits(values: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Mean and 95 % percentile interval of replicates."""
-    low, high = np.percentile(values, [2.5, 97.5])
-    return float(values.mean()), float(low), float(high)

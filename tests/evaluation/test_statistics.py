@@ -59,7 +59,8 @@ def test_the_interval_is_that_of_the_bootstrap_in_scipy() -> None:
 
 def test_the_interval_covers_the_truth_about_as_often_as_it_says() -> None:
     generator = np.random.default_rng(8)
-    intervals = [estimate_mean(generator.normal(size=40), resampling(40, s, 400)).interval() for s in range(400)]
+    counts = resampling(40, seed=0, resamples=400)
+    intervals = [estimate_mean(generator.normal(size=40), counts).interval() for _ in range(400)]
     assert 0.90 <= np.mean([low <= 0 <= high for _, low, high in intervals]) <= 0.98
 
 
