@@ -54,8 +54,9 @@ class CollectConfig(BaseModel):
 class OnlineLearner:
     """Hybrid SAC with its environment and its log; `run` goes on from wherever it stands.
 
-    Rewards are centred on the median of the newest ones, and the critics' biases are moved by what that adds to every
-    return (reward centring, Naik et al. 2024, arXiv:2405.09999), so Q stays near 0 while the policy improves.
+    Rewards are centred on the median of the newest ones and Q on its mean over the newest states (reward centring, Naik
+    et al. 2024, arXiv:2405.09999): the policy improves faster than Q could travel to a new level, and only differences
+    of Q matter to it. Not where an episode can terminate: there the level is what ending it is compared with.
     """
 
     def __init__(self, config: CollectConfig) -> None:
@@ -121,19 +122,23 @@ class OnlineLearner:
         return done
 
     def _recentre(self) -> None:
-        newest = np.arange(max(0, len(self.log) - 5_000), len(self.log))
-        centre = float(np.median(self.log.take(newest).reward))
-        if self.updates and not self.config.scenario.limits.energy_budget_j:
-            moved = (self.centre - centre) * self.config.agent.reward.scale / (1.0 - self.config.agent.discount)
-            self.agent.critic.shift(moved)
-            self.agent.target.shift(moved)
-        self.centre = centre if not self.config.scenario.limits.energy_budget_j else 0.0
+        """Zero of the reward: the median of the newest rewards; zero of Q: its mean over the newest states."""
+        newest = self.log.take(np.arange(max(0, len(self.log) - 5_000), len(self.log)))
+        self.centre = float(np.median(newest.reward))
+        batch = to_batch(newest.take(slice(-1_000, None)), self.kind, self.config.scenario)
+        with torch.no_grad():
+            critic = self.agent.critic
+            q = critic.all_choices(critic.encode(batch.observation), batch.action.continuous)
+            level = float(q.gather(2, batch.action.choice.expand(2, -1)[..., None]).mean())
+        self.agent.critic.shift(-level)
+        self.agent.target.shift(-level)
 
     def _learn(self) -> dict[str, torch.Tensor]:
         if self.updates == 0:
             first = self.log.take(np.arange(len(self.log)))
             fit_normalisers(self.agent.networks, to_tensors(first.observations(self.kind, self.config.scenario)[0]))
-        if self.updates % self.config.centre_every == 0:
+        centred = self.config.agent.reward.transform == "centred" and not self.config.scenario.limits.energy_budget_j
+        if centred and self.updates % self.config.centre_every == 0:
             self._recentre()
         rows = self.numbers.integers(0, len(self.log), self.config.agent.batch_size)
         batch = to_batch(self.log.take(rows), self.kind, self.config.scenario)
