@@ -15,6 +15,7 @@ from uavrl.datasets.minari_io import write_minari
 from uavrl.datasets.report import describe, render
 from uavrl.datasets.selection import Quality, select
 from uavrl.datasets.sources import load_source
+from uavrl.errors import DatasetError
 from uavrl.simulation.observations import ObservationKind
 
 Source = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME|FILE|MINARI_ID")]
@@ -36,7 +37,11 @@ class DataShow:
         summary = describe(transitions, scenario)
         Console().print(render(summary, self.source))
         if self.json is not None:
-            self.json.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+            try:
+                self.json.parent.mkdir(parents=True, exist_ok=True)
+                self.json.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+            except OSError as error:
+                raise DatasetError(f"{self.json}: cannot be written: {error.strerror}") from None
 
 
 @dataclass(frozen=True)

@@ -90,6 +90,7 @@ def _write_parquet(path: Path, arrays: dict[str, NDArray[Any]], scenario: Scenar
         compression_level=9,
         use_dictionary=[name for name in others if name not in split and COLUMNS[name.split(".")[0]].kind != "bool"],
         column_encoding=split,
+        write_page_checksum=True,
     )
 
 
@@ -147,7 +148,7 @@ def _read(path: Path, *, only_scenario: bool = False) -> tuple[dict[str, NDArray
             with path.open("rb") as opened, NpzFile(opened, allow_pickle=False) as archive:
                 text = str(archive[_SCENARIO]) if _SCENARIO in archive else None
                 return {name: np.asarray(archive[name]) for name in wanted if name in archive}, text
-        with pq.ParquetFile(path) as file:
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
             stored = (file.schema_arrow.metadata or {}).get(_SCENARIO.encode())
             text = None if stored is None else stored.decode()
             names = [name for name in wanted if name in file.schema_arrow.names]

@@ -11,7 +11,6 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
-from uavrl import ENVIRONMENT_ID
 from uavrl.datasets.transitions import Transitions
 from uavrl.datasets.validation import validate
 from uavrl.errors import DatasetError
@@ -112,7 +111,7 @@ def _environment(t: Transitions, scenario: Scenario, kind: ObservationKind) -> E
     if (t.layout_m == t.layout_m[0]).all():
         kwargs["layout"] = t.layout_m[0].tolist()
     entry = "uavrl.simulation.environment:DataCollectionEnv"
-    return EnvSpec(id=ENVIRONMENT_ID, entry_point=entry, kwargs=kwargs)
+    return EnvSpec(id="uavrl/DataCollection-v0", entry_point=entry, kwargs=kwargs)
 
 
 def _episode(t: Transitions, rows: slice, before: Any, after: Any) -> dict[str, Any]:

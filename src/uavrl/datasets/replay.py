@@ -49,11 +49,12 @@ class ReplayLog:
         start, stop = self._length, self._length + len(rows["reward"])
         if stop > self.capacity:
             raise DatasetError(f"log is full: {stop} rows, allowed: {self.capacity}")
+        for name, values in rows.items():  # all before the first is written: a refused batch leaves the log as it was
+            expected = (stop - start, *COLUMNS[name].row_shape(self.devices))
+            if values.shape != expected:
+                raise DatasetError(f"column '{name}' has shape {values.shape}, allowed: {expected}")
         for name, values in rows.items():
-            into = self._columns[name][start:stop]
-            if values.shape != into.shape:
-                raise DatasetError(f"column '{name}' has shape {values.shape}, allowed: {into.shape}")
-            into[:] = values
+            self._columns[name][start:stop] = values
         self._length = stop
 
     def take(self, indices: NDArray[np.integer[Any]]) -> Transitions:
