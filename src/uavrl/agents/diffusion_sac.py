@@ -46,7 +46,11 @@ class DiffusionSacConfig(AgentConfig):
     )
     gradient_steps: int = Field(1, ge=1, description="k of last_k")
     choice_temperature: float = Field(0.5, gt=0, description="tau of p = softmax(z / tau)")
-    normalise_q: bool = Field(True, description="divide L_g by the batch's mean |Q|, which gives eta a meaning")
+    q_scale: Literal["spread", "absolute", "none"] = Field(
+        "spread",
+        description="L_g is divided by Q's mean deviation over the choices, which no shift of the rewards changes; "
+        "by the batch's mean |Q|; or not at all (paper). Without a scale eta has no meaning",
+    )
     displacement_weight: float = Field(3.0, gt=0, description="weight of a continuous entry in L_bc; 1 in the paper")
     actor_average: float = Field(0.995, ge=0, lt=1, description="decay of the target actor; 0: no average")
     candidates: int = Field(1, ge=1, description="actions drawn at a decision; the one of largest min Q is taken")
@@ -144,6 +148,7 @@ class DiffusionSac(Agent):
         probability = functional.softmax(z / config.choice_temperature, dim=-1)
         with torch.no_grad():
             context = self.critic.encode(observation)
+        every = self.critic.all_choices(context, w).amin(dim=0)  # (B, D)
         if config.guidance == "softmax":
             q = self.critic.value(context, w, probability).amin(dim=0)
         else:
@@ -151,8 +156,12 @@ class DiffusionSac(Agent):
             if config.guidance == "straight_through":
                 hard = functional.one_hot(z.argmax(dim=-1), z.shape[-1]).to(z.dtype)
                 weight = hard + probability - probability.detach()
-            q = (self.critic.all_choices(context, w).amin(dim=0) * weight).sum(dim=-1)
-        scale = q.detach().abs().mean().clamp(min=1e-3) if config.normalise_q else 1.0
+            q = (every * weight).sum(dim=-1)
+        scale: Tensor | float = 1.0
+        if config.q_scale == "absolute":
+            scale = q.detach().abs().mean().clamp(min=1e-3)
+        elif config.q_scale == "spread":
+            scale = every.detach().std(dim=-1).mean().clamp(min=1e-3)
         metrics = {"guided_q": q.detach().mean(), "choice_confidence": probability.detach().amax(dim=-1).mean()}
         return -q.mean() / scale, metrics
 

@@ -33,7 +33,7 @@ PRESETS: dict[str, dict[str, BcConfig | DiffusionSacConfig]] = {
             gradient="full_chain",
             bc_weight=0.5,
             cql_weight=0.0,
-            normalise_q=False,
+            q_scale="none",
             displacement_weight=1.0,
         ),
     },
