@@ -172,6 +172,19 @@ def test_idling_is_said_to_pay_where_it_does() -> None:
     assert any("idling optimal" in note for note in notes)
 
 
+def test_flights_flown_before_count_as_if_flown_now(judgement: Judgement) -> None:
+    environments = evaluation_set(SHORT, "random", 6, fading_seeds=2)
+    before = {name: judgement.flights[name] for name in ("tdm", "planner", "idle")}
+    again = judge({"wanderer": Wanderer()}, environments, flown=before).report
+    assert [*again["policies"]] == [*judgement.report["policies"]]
+    for name in again["policies"]:
+        assert again["policies"][name]["return"] == judgement.report["policies"][name]["return"]
+    with pytest.raises(ConfigError, match="'tdm' was flown in other environments"):
+        judge({}, evaluation_set(SHORT, "random", 6, fading_seeds=2, seed=3), flown=before)
+    with pytest.raises(ConfigError, match="'idle' takes part twice"):
+        judge({"idle": Wanderer()}, environments, flown=before)
+
+
 def test_who_takes_part_is_checked() -> None:
     environments = evaluation_set(SHORT, "random", 1)
     with pytest.raises(ConfigError, match="baseline 'planner' does not take part, allowed: tdm"):

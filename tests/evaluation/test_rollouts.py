@@ -78,6 +78,16 @@ def test_draws_are_standard() -> None:
     assert ((draws.sight >= 0) & (draws.sight < 1)).all()
 
 
+def test_one_environment_alone_meets_what_it_meets_among_all() -> None:
+    environments = evaluation_set(load_scenario("released", max_steps=70), "random", 4, fading_seeds=2)
+    policy = Scripted((1, 5, 0, 9), (2.0, 1.0))
+    among, alone = fly(policy, environments), fly(policy, environments.only(2))
+    assert among.reward[:, 4:6] == pytest.approx(alone.reward, rel=1e-12)  # sums are ordered by the batch size
+    assert environments.only(2).unit.tolist() == [0]
+    assert environments.only(1).only(0).equals(environments.only(1))
+    assert not environments.only(1).equals(environments.only(2))
+
+
 def test_a_policy_meets_the_same_whoever_flew_before() -> None:
     environments = evaluation_set(load_scenario("released", max_steps=70), "random", 2)
     alone = fly(Wanderer(), environments)

@@ -51,7 +51,8 @@ class Evaluate:
         if not self.policy:
             raise ConfigError("--policy is missing, needed: 1 or more")
         for path in (self.json, self.markdown):
-            _check_writable(path)
+            if path is not None:
+                check_writable(path)
         scenario = load_scenario(self.scenario)
         from uavrl.evaluation.report import judge, markdown_table, rich_table, write_json, write_text
         from uavrl.evaluation.rollouts import evaluation_set
@@ -81,10 +82,12 @@ class Evaluate:
         Console(width=None if sys.stdout.isatty() else 160).print(rich_table(judgement.report))
 
 
-def _check_writable(path: Path | None) -> None:
-    """Refuse now what could not be written after an hour's flights."""
-    if path is None:
-        return
+def check_writable(path: Path) -> None:
+    """Refuse now what could not be written after an hour's flights.
+
+    Raises:
+        ConfigError: `path` is a directory, or lies in one that does not exist or may not be written.
+    """
     if path.is_dir():
         raise ConfigError(f"file '{path}' is a directory, allowed: a file to write")
     if not path.parent.is_dir():

@@ -27,8 +27,7 @@ def resolve(spec: str, scenario: Scenario) -> Policy:
     if Path(spec).is_dir():
         from uavrl.training.policy import load_policy  # here: torch is slow to import
 
-        policy: Policy = load_policy(Path(spec), scenario)
-        return policy
+        return load_policy(Path(spec), scenario)
     if ":" in spec:
         return _import(spec, scenario)
     raise ConfigError(

@@ -98,6 +98,7 @@ def judge(
     policies: Mapping[str, Policy],
     environments: EvaluationSet,
     *,
+    flown: Mapping[str, Flights] | None = None,
     baselines: Sequence[str] = (),
     data: Transitions | None = None,
     deterministic: bool = False,
@@ -110,6 +111,7 @@ def judge(
         policies: name -> policy; the names "tdm" and "planner" are the ends of `normalised_return`, and "planner" the
             yardstick of `excess_cost`.
         environments: what all of them fly.
+        flown: flights of further policies on these environments, name -> flights; they come first.
         baselines: names that every policy is compared with; empty: those of `BASELINES` that take part.
         data: logged transitions whose own behaviour is reported as "data".
         deterministic: ask the policies for their deterministic action.
@@ -117,22 +119,29 @@ def judge(
         show_progress: bars on stderr where that is a terminal.
 
     Raises:
-        ConfigError: no policy, a baseline that does not take part, or a policy that cannot be flown.
+        ConfigError: no policy, two of one name, a baseline that does not take part, flights of other environments, or
+            a policy that cannot be flown.
         DatasetError: the data's K is not the scenario's.
     """
-    names = [*policies, *([DATA] if data is not None else [])]
-    if not policies:
+    flown = flown or {}
+    names = [*flown, *policies, *([DATA] if data is not None else [])]
+    if not (flown or policies):
         raise ConfigError("policies is empty, needed: 1 or more")
-    if data is not None and DATA in policies:
-        raise ConfigError(f"policy '{DATA}' has the name of the data's own behaviour, allowed: any other name")
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise ConfigError(
+            f"policy '{twice[0]}' takes part twice, allowed: one of each name ('{DATA}' is the data's own)"
+        )
+    elsewhere = [name for name, flights in flown.items() if not flights.evaluation_set.equals(environments)]
+    if elsewhere:
+        raise ConfigError(f"policy '{elsewhere[0]}' was flown in other environments, allowed: those it is judged on")
     unknown = [name for name in baselines if name not in names]
     if unknown:
         raise ConfigError(f"baseline '{unknown[0]}' does not take part, allowed: {', '.join(names)}")
     observed = {} if data is None else {DATA: behaviour(data, environments.scenario, seed=environments.seed + 1)}
-    flights = {
-        name: fly(policy, environments, name=name, deterministic=deterministic, show_progress=show_progress)
-        for name, policy in policies.items()
-    }
+    flights = dict(flown)
+    for name, policy in policies.items():
+        flights[name] = fly(policy, environments, name=name, deterministic=deterministic, show_progress=show_progress)
     estimates = {**estimate(flights, environments), **observed}
     report = {
         "policies": {name: _intervals(values) for name, values in estimates.items()},

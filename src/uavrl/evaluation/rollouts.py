@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,25 @@ class EvaluationSet:
     unit: NDArray[np.int64]  # (E,) which independent unit an environment belongs to: what the bootstrap resamples
     seed: int
     fading_seeds: int
+    first: int = 0  # index of environment 0: what its draws are made from
+
+    def only(self, episode: int) -> EvaluationSet:
+        """Environment `episode` alone, under the draws that it has in the whole set."""
+        one = slice(episode, episode + 1)
+        return replace(
+            self,
+            layout_m=self.layout_m[one],
+            start_m=self.start_m[one],
+            unit=np.zeros(1, dtype=np.int64),
+            first=self.first + episode,
+        )
+
+    def equals(self, other: EvaluationSet) -> bool:
+        """Whether flights on both meet the same layouts, starts and draws under the same scenario."""
+        settings = ("scenario", "seed", "fading_seeds", "first")
+        return all(getattr(self, name) == getattr(other, name) for name in settings) and all(
+            np.array_equal(getattr(self, name), getattr(other, name)) for name in ("layout_m", "start_m")
+        )
 
     @property
     def episodes(self) -> int:
@@ -63,7 +82,7 @@ class EvaluationSet:
         for flight in np.flatnonzero(wanted):
             episode, repeat = divmod(int(flight), self.fading_seeds)
             # both counted from 1: a seed sequence takes (seed, i) and (seed, i, 0) for the same
-            generator = np.random.default_rng((self.seed, episode, 1 + repeat, 1 + block))
+            generator = np.random.default_rng((self.seed, self.first + episode, 1 + repeat, 1 + block))
             scatter[:, flight] = generator.standard_normal((_BLOCK, 2))
             sight[:, flight] = generator.random(_BLOCK)
         return Draws(scatter=scatter, sight=sight)
