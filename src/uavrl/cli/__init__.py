@@ -31,6 +31,7 @@ COMMANDS: dict[str, Command] = {
     "scenario check": Command("uavrl.cli.scenario:ScenarioCheck", "validate a scenario file"),
     "data show": Command("uavrl.cli.data:DataShow", "report behaviour and coverage of logged flights"),
     "data select": Command("uavrl.cli.data:DataSelect", "select logged flights by size, quality and seed"),
+    "data convert": Command("uavrl.cli.data:DataConvert", "write logged flights in another form"),
     "collect": Command("uavrl.cli.collect:Collect", "log the flights of an agent that learns online"),
     "train": Command("uavrl.cli.train:Train", "learn a policy from logged flights alone"),
     "evaluate": Command("uavrl.cli.evaluate:Evaluate", "fly policies on equal layouts, starts and fading"),
