@@ -7,10 +7,11 @@ from collections.abc import Callable
 from uavrl.errors import ConfigError
 from uavrl.policies.base import Policy, SimulatorView
 from uavrl.policies.heuristics import HEURISTICS
+from uavrl.policies.planner import Planner
 
 __all__ = ["POLICIES", "Policy", "SimulatorView", "make_policy"]
 
-POLICIES: dict[str, Callable[[], Policy]] = {**HEURISTICS}
+POLICIES: dict[str, Callable[[], Policy]] = {**HEURISTICS, "planner": Planner}
 
 
 def make_policy(name: str) -> Policy:

@@ -36,8 +36,9 @@ class ServiceModel:
         grid_m, bits = np.broadcast_arrays(distance_m, sizes[:, None])
         seconds, arrival = channel.expected_service(grid_m, bits, scenario.channel)
         with np.errstate(divide="ignore"):
-            cost = np.where(arrival > 0, (seconds + self.decision_s) / arrival, np.inf)
-        self._tables = np.stack([seconds, arrival, np.minimum(cost, 1e9)])  # (3, sizes, _TABLE)
+            cost = np.minimum((seconds + self.decision_s) / arrival, 1e9)  # finite, for interpolation
+        self.shortest_s = cost.min(axis=1)[self._row]  # (K,) c_k from the best place
+        self._tables = np.stack([seconds, arrival, cost])  # (3, sizes, _TABLE)
 
     def _look_up(self, table: Float, position_m: Float, layout_m: Float) -> Float:
         offset = layout_m - position_m[..., None, :]
@@ -74,19 +75,17 @@ class ServiceModel:
         result: Float = 0.5 * root.sum(axis=-1) ** 2
         return result
 
-    def grid_m(self) -> Float:
-        """Points of the area to search first, (G, 2) (m)."""
+    def hover_map(self, layout_m: Float) -> tuple[Float, Float]:
+        """Points of a grid over the area (G, 2) (m), and `hover_age_s` at each for each layout (N, G)."""
         axis = np.linspace(0.0, 1.0, _GRID)
-        points: Float = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2) * self.size_m
-        return points
+        grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2) * self.size_m
+        # a column of the grid at a time keeps the arrays at N x 41 x K
+        ages = [self.hover_age_s(column[None], layout_m[:, None]) for column in np.split(grid, _GRID)]
+        return grid, np.concatenate(ages, axis=1)
 
     def best_hover_m(self, layout_m: Float) -> Float:
         """x* = argmin_x (sum_k sqrt(delta_k c_k(x)))^2 of each layout, (N, 2) (m): a grid, then ever finer ones."""
-        grid = self.grid_m()
-        # a column of the grid at a time keeps the arrays at N x 41 x K
-        ages = np.concatenate(
-            [self.hover_age_s(column[None], layout_m[:, None]) for column in np.split(grid, _GRID)], axis=1
-        )
+        grid, ages = self.hover_map(layout_m)
         best: Float = grid[ages.argmin(axis=1)]
         steps = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], indexing="ij"), axis=-1).reshape(-1, 2)
         spacing = self.size_m / (_GRID - 1)
