@@ -1,0 +1,102 @@
+"""Lower bounds on the age of information, derived in docs/bounds.md.
+
+They hold where every service takes a known least time: fading "none" or "ergodic" (a lucky Rayleigh draw beats any of
+them) and a fixed decision time. Ages start at 0. Priorities and packet sizes may differ between the devices.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from uavrl.errors import ConfigError
+from uavrl.physics import channel
+from uavrl.scenario import Scenario
+
+Float = NDArray[np.float64]
+
+
+def service_s(scenario: Scenario, horizontal_m: ArrayLike) -> Float:
+    """c_k = T_com + T_exec (s) at horizontal distances (..., K) or one number; infinite where every packet is lost.
+
+    Raises:
+        ConfigError: the scenario's service times are random or measured, so that nothing bounds them.
+    """
+    link = scenario.channel
+    if link.fading not in ("none", "ergodic"):
+        raise ConfigError(f"channel.fading = {link.fading!r}: the bounds need 'none' or 'ergodic'")
+    if scenario.airframe.decision_time != "fixed":
+        raise ConfigError(f"airframe.decision_time = {scenario.airframe.decision_time!r}: the bounds need 'fixed'")
+    bits = np.array(scenario.traffic.packet_bits_each)
+    distance_m, bits = np.broadcast_arrays(np.asarray(horizontal_m, dtype=np.float64), bits)
+    seconds, arrival = channel.expected_service(distance_m, bits, link)
+    service: Float = np.where(arrival > 0, seconds + scenario.airframe.decision_s, np.inf)
+    return service
+
+
+def _time_bound_s(scenario: Scenario, service: Float, elapsed_s: ArrayLike) -> Float:
+    elapsed = np.asarray(elapsed_s, dtype=np.float64)
+    if not (elapsed > 0).all():
+        raise ConfigError(f"elapsed_s = {float(elapsed.min()):g}, allowed: more than 0")
+    if elapsed.max() > scenario.traffic.max_age_s:
+        raise ConfigError(
+            f"elapsed_s = {float(elapsed.max()):g}, allowed: at most traffic.max_age_s = "
+            f"{scenario.traffic.max_age_s:g}, beyond which ages are clipped"
+        )
+    priority = np.array(scenario.traffic.priority_each)
+    can = np.isfinite(service)
+    finite = np.where(can, service, 0.0)
+    root = np.sqrt(priority * finite).sum(axis=-1)
+    never = np.where(can, 0.0, priority).sum(axis=-1)
+    bound: Float = 0.5 * elapsed * (root**2 / (elapsed + finite.sum(axis=-1)) + never)
+    return bound
+
+
+def mean_age_bound_s(scenario: Scenario, elapsed_s: ArrayLike) -> Float:
+    """Least time average of sum_k delta_k A_k over the first `elapsed_s` (...) of any flight, (...) (s).
+
+    (T/2) (sum_k sqrt(delta_k c_k))^2 / (T + sum_k c_k), with c_k the service time from straight above device k.
+
+    Raises:
+        ConfigError: random service times, or a time that is not positive or at which ages are clipped.
+    """
+    return _time_bound_s(scenario, service_s(scenario, 0.0), elapsed_s)
+
+
+def hover_age_bound_s(scenario: Scenario, layout_m: Float, position_m: Float, elapsed_s: ArrayLike) -> Float:
+    """As `mean_age_bound_s`, for a flight that stays at `position_m` (..., 2) over `layout_m` (..., K, 2), (...) (s).
+
+    (T/2) (sum_k sqrt(delta_k c_k(x)))^2 / (T + sum_k c_k(x)).
+
+    Raises:
+        ConfigError: as `mean_age_bound_s`.
+    """
+    distance_m = np.linalg.norm(layout_m - position_m[..., None, :], axis=-1)
+    return _time_bound_s(scenario, service_s(scenario, distance_m), elapsed_s)
+
+
+def step_mean_age_bound_s(scenario: Scenario, steps: int) -> float:
+    """Least mean, over the first `steps` steps of any flight, of sum_k delta_k A_k after each step (s).
+
+    For equal devices, the mean over i of min over j <= min(i, K) of
+    [j (j-1) c / 2 + (K-j) (j c + (i-j) e)] / K, with e the shortest step without service.
+
+    Raises:
+        ConfigError: random service times, or no step.
+    """
+    if steps < 1:
+        raise ConfigError(f"steps = {steps}, allowed: 1 or more")
+    frame, oldest_s = scenario.airframe, scenario.traffic.max_age_s
+    service = np.sort(service_s(scenario, 0.0))
+    service = service[np.isfinite(service)]
+    quiet_s = min(max(frame.decision_s, frame.min_idle_s), float(service.min(initial=np.inf)))
+    priority = np.sort(scenario.traffic.priority_each)[::-1]
+    elapsed_s = np.concatenate([[0.0], np.cumsum(service)])  # of the j shortest services
+    served = np.minimum(elapsed_s, oldest_s)  # least age of the device that was served j services ago
+    below = np.concatenate([[0.0], np.cumsum(priority[: len(service)] * served[:-1])])
+    rest = np.concatenate([[priority.sum()], priority.sum() - np.cumsum(priority)])[: len(elapsed_s)]
+    i = np.arange(1, steps + 1)[:, None]
+    j = np.arange(len(elapsed_s))
+    never_s = np.minimum(elapsed_s + (i - j) * quiet_s, oldest_s)
+    ages = np.where(j <= i, below + rest * never_s, np.inf)
+    return float(ages.min(axis=1).mean())
