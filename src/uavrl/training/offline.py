@@ -22,6 +22,7 @@ from uavrl.networks import Observation, fit_normalisers
 from uavrl.scenario import Scenario
 from uavrl.training.batches import OBSERVATION_OF, reward_transform, spaces_of, to_batch, transformed
 from uavrl.training.checkpoint import agent_tensors, load_checkpoint, recover, restore_agent, save_checkpoint
+from uavrl.training.interrupts import held_interrupts
 from uavrl.training.log import MetricsLog, Reporter
 from uavrl.training.policy import AgentPolicy
 
@@ -143,24 +144,27 @@ class OfflineLearner:
         log.cut(self.updates)
         policy = AgentPolicy(self.config.agent.name, self.agent, self.config.scenario)
         config, text = self.config, ""
-        try:
+        with held_interrupts() as interrupted:
             while self.updates < config.updates:
                 metrics = self.step()
-                if self.updates % config.log_every == 0 or self.updates == config.updates:
+                stop = interrupted()
+                logs = self.updates % config.log_every == 0 or self.updates == config.updates
+                saves = self.updates % config.save_every == 0 or stop
+                if logs or saves:  # nothing is saved that has not been looked at
                     row = {name: float(value) for name, value in metrics.items()}
                     self._check(row)
+                if logs:
                     log.write({"step": self.updates} | row)
                     shown = ("q", "critic_loss", "bc_loss")
                     text = ", ".join(f"{name} {row[name]:.3g}" for name in shown if name in row)
                 if evaluate and config.evaluate_every and self.updates % config.evaluate_every == 0:
                     flown = evaluate(policy)
                     log.write({"step": self.updates} | flown)
-                if self.updates % config.save_every == 0:
+                if saves:
                     self.save(directory)
+                if stop:
+                    raise KeyboardInterrupt
                 report(self.updates, text)
-        except KeyboardInterrupt:
-            self.save(directory)
-            raise
         self.save(directory)
         return policy
 

@@ -32,6 +32,7 @@ from uavrl.training.checkpoint import (
     save_checkpoint,
     set_numpy_state,
 )
+from uavrl.training.interrupts import held_interrupts
 from uavrl.training.log import MetricsLog, Reporter
 
 
@@ -145,7 +146,11 @@ class OnlineLearner:
         reward = self.config.agent.reward
         batch = replace(batch, reward=transformed(batch.reward, self.centre, reward.scale, reward))
         self.updates += 1
-        return self.agent.update(batch, self.generator)
+        metrics = self.agent.update(batch, self.generator)
+        for name in ("critic_loss", "actor_loss"):  # each time: the next action of a policy of NaN cannot be drawn
+            if not metrics[name].isfinite():
+                raise DivergenceError(f"training diverged: {name} = {float(metrics[name])} after {self.updates} updates")
+        return metrics
 
     def run(self, directory: Path, report: Reporter, save_every: int = 20_000) -> Transitions:
         """Fly and learn until all episodes are logged; checkpoints every `save_every` steps and on interrupt.
@@ -157,8 +162,7 @@ class OnlineLearner:
         log.cut(len(self.log))
         recent: list[float] = []
         saved = len(self.log)
-        metrics: dict[str, torch.Tensor] = {}
-        try:
+        with held_interrupts() as interrupted:
             while self.finished < self.config.episodes:
                 for value in self._fly():
                     recent = [*recent[-19:], value]
@@ -168,19 +172,15 @@ class OnlineLearner:
                         metrics = self._learn()
                         if self.updates % 1000 == 0:
                             row = {name: float(value) for name, value in metrics.items()}
-                            if not np.isfinite(row["critic_loss"]):
-                                raise DivergenceError(
-                                    f"critic_loss = {row['critic_loss']} after {self.updates} updates"
-                                )
                             log.write({"step": len(self.log), "updates": self.updates, "centre": self.centre} | row)
                 mean = f", return {np.mean(recent):.0f} (last {len(recent)})" if recent else ""
                 report(len(self.log), f"episode {self.finished}{mean}")
-                if len(self.log) - saved >= save_every:
+                stop = interrupted()
+                if stop or len(self.log) - saved >= save_every:
                     self.save(directory)
                     saved = len(self.log)
-        except KeyboardInterrupt:
-            self.save(directory)
-            raise
+                if stop:
+                    raise KeyboardInterrupt
         self.save(directory)
         return self.log.to_transitions()
 
