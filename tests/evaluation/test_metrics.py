@@ -7,7 +7,7 @@ from tests.evaluation.flying import Scripted, Wanderer, overhead, timed_scenario
 from uavrl.evaluation.metrics import age_percentile_s, flight_metrics, jain
 from uavrl.evaluation.rollouts import Flights, evaluation_set, fly
 from uavrl.physics.energy import hover_power_w
-from uavrl.scenario import Scenario
+from uavrl.scenario import Scenario, load_scenario
 
 
 def judged(scenario: Scenario, *devices: int) -> tuple[Flights, dict[str, float]]:
@@ -96,3 +96,15 @@ def test_the_age_percentile_agrees_with_ages_looked_at_every_millisecond() -> No
 @pytest.mark.parametrize(("share", "index"), [([2, 2, 2], 1.0), ([1, 0, 0, 0], 0.25), ([1, 3], 0.8), ([0, 0], np.nan)])
 def test_jains_index(share: list[float], index: float) -> None:
     assert jain(np.array([share], dtype=float))[0] == pytest.approx(index, nan_ok=True)
+
+
+def test_a_flight_that_ends_before_the_others_counts_nothing_more() -> None:
+    scenario = load_scenario("released", devices=4, max_steps=None, time_budget_s=8.0)
+    environments = evaluation_set(scenario, "random", 4)
+    policy = Scripted((1, 3, 2, 4, 0))
+    flights = fly(policy, environments)
+    assert len(set(flights.steps)) > 2
+    among = flight_metrics(flights)
+    for episode in range(4):
+        for name, alone in flight_metrics(fly(policy, environments.only(episode))).items():
+            assert among[name][episode] == pytest.approx(alone[0], rel=1e-9), name
