@@ -10,6 +10,7 @@ from typing import Literal
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
+from torch.nn import functional
 
 from uavrl.actions import HybridAction
 from uavrl.networks import NetworkConfig, Observation, Spaces
@@ -57,6 +58,12 @@ class AgentConfig(BaseModel):
         "step", description="per second: gamma^duration, the semi-Markov discount of a per-second objective"
     )
     polyak: float = Field(0.005, gt=0, le=1, description="target <- (1 - polyak) target + polyak network, each update")
+    huber: float | None = Field(
+        1.0,
+        gt=0,
+        description="Bellman errors beyond this count linearly: with fading drawn once a packet rewards have no finite "
+        "variance; none: squared, as in the paper",
+    )
     gradient_clip: float | None = Field(10.0, gt=0, description="largest gradient norm of a network")
 
 
@@ -82,6 +89,14 @@ def discounts(batch: Batch, config: AgentConfig) -> Tensor:
     if config.discount_per == "second":
         return torch.pow(config.discount, batch.duration_s) * (1.0 - batch.terminated)
     return config.discount * (1.0 - batch.terminated)
+
+
+def bellman_loss(q: Tensor, target: Tensor, huber: float | None) -> Tensor:
+    """Half the squared error of both Q functions (2, B) to the target (B,), each a mean, summed; linear from `huber`."""
+    wanted = target.expand_as(q)
+    if huber is None:
+        return 0.5 * functional.mse_loss(q, wanted, reduction="none").mean(dim=1).sum()
+    return functional.huber_loss(q, wanted, reduction="none", delta=huber).mean(dim=1).sum()
 
 
 def minimise(

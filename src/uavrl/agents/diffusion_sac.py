@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from uavrl.actions import HybridAction, decode, encode
-from uavrl.agents.base import Agent, AgentConfig, Batch, Metrics, adam, discounts, minimise, move_towards
+from uavrl.agents.base import Agent, AgentConfig, Batch, Metrics, adam, bellman_loss, discounts, minimise, move_towards
 from uavrl.agents.diffusion_actor import ChainNoise, DiffusionActor, DiffusionConfig, block_mean
 from uavrl.diffusion import add_noise, predict_x0, straight_through_clamp
 from uavrl.networks import Critic, Observation, Spaces, make_critic, repeat
@@ -101,7 +101,7 @@ class DiffusionSac(Agent):
             target = batch.reward + discounts(batch, self.config) * q_next
         context = self.critic.encode(batch.observation)
         q = action_value(self.critic, context, batch.action, self.spaces.choices)
-        loss = 0.5 * (q - target).square().mean(dim=1).sum()
+        loss = bellman_loss(q, target, self.config.huber)
         metrics = {"bellman_loss": loss.detach(), "q": q.detach().mean(), "target_q": target.mean()}
         if uniform is not None:
             penalty = conservative_penalty(self.critic, context, uniform, q)

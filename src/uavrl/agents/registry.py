@@ -34,6 +34,7 @@ PRESETS: dict[str, dict[str, BcConfig | DiffusionSacConfig]] = {
             bc_weight=0.5,
             cql_weight=0.0,
             q_scale="none",
+            huber=None,
             displacement_weight=1.0,
         ),
     },

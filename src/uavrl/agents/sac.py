@@ -25,6 +25,7 @@ from uavrl.agents.base import (
     Metrics,
     RewardConfig,
     adam,
+    bellman_loss,
     discounts,
     minimise,
     move_towards,
@@ -38,9 +39,9 @@ class SacConfig(AgentConfig):
 
     name: Literal["sac"] = "sac"
     reward: RewardConfig = RewardConfig(transform="centred", clip=10.0)
-    batch_size: int = Field(128, ge=1, description="transitions an update")
+    batch_size: int = Field(256, ge=1, description="transitions an update")
     learning_rate: float = Field(6e-4, gt=0, description="of Adam")
-    discount: float = Field(0.995, ge=0, lt=1, description="gamma; at .99 a flight to a better place barely pays")
+    discount: float = Field(0.99, ge=0, lt=1, description="gamma, per step or per second")
     continuous_entropy: float = Field(-2.0, description="target entropy of tanh w, H_c")
     choice_entropy: float = Field(0.3, ge=0, lt=1, description="target entropy of d, as a share of log D")
     initial_temperature: float = Field(0.1, gt=0, description="both temperatures at the start")
@@ -89,7 +90,7 @@ class Sac(Agent):
         }
 
     def critic_loss(self, batch: Batch, noise: Tensor) -> tuple[Tensor, Metrics]:
-        """Half the squared Bellman error of both Q functions, summed; noise (B, C)."""
+        """Bellman error of both Q functions, summed; noise (B, C)."""
         with torch.no_grad():
             output = self.actor(batch.next_observation)
             sample = SquashedSample(output, noise)
@@ -99,7 +100,7 @@ class Sac(Agent):
             target = batch.reward + discounts(batch, self.config) * value
         choice = functional.one_hot(batch.action.choice, q_next.shape[-1]).to(target.dtype)
         q = self.critic.value(self.critic.encode(batch.observation), batch.action.continuous, choice)
-        loss = 0.5 * (q - target).square().mean(dim=1).sum()
+        loss = bellman_loss(q, target, self.config.huber)
         return loss, {"critic_loss": loss.detach(), "q": q.detach().mean()}
 
     def actor_loss(self, batch: Batch, noise: Tensor) -> tuple[Tensor, Metrics]:
