@@ -55,8 +55,10 @@ def save_checkpoint(directory: Path, document: dict[str, Any], tensors: dict[str
     path = temporary / MANIFEST
     path.write_text(json.dumps({**document, "files": files, "versions": versions}, indent=1), encoding="utf-8")
     _sync(path)
+    _sync(temporary)
     old = directory.with_name(f".{directory.name}.{os.getpid()}.old")
     if directory.exists():
+        shutil.rmtree(old, ignore_errors=True)  # of a killed writer with this number, which containers give again
         directory.rename(old)
     temporary.rename(directory)
     _sync(directory.parent)
