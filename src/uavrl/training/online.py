@@ -149,7 +149,9 @@ class OnlineLearner:
         metrics = self.agent.update(batch, self.generator)
         for name in ("critic_loss", "actor_loss"):  # each time: the next action of a policy of NaN cannot be drawn
             if not metrics[name].isfinite():
-                raise DivergenceError(f"training diverged: {name} = {float(metrics[name])} after {self.updates} updates")
+                raise DivergenceError(
+                    f"training diverged: {name} = {float(metrics[name])} after {self.updates} updates"
+                )
         return metrics
 
     def run(self, directory: Path, report: Reporter, save_every: int = 20_000) -> Transitions:
