@@ -33,9 +33,11 @@ def at(horizontal_m: float, link: Channel = PAPER) -> tuple[float, float, float]
 
 class TestGeometry:
     def test_distance_and_elevation(self) -> None:
-        distance = channel.link_distance_m(np.array([0.0, 100.0, 100.0 * math.sqrt(3.0)]), 100.0)
+        horizontal = np.array([0.0, 100.0, 100.0 * math.sqrt(3.0)])
+        distance = channel.link_distance_m(horizontal, 100.0)
         assert distance == pytest.approx([100.0, 100.0 * math.sqrt(2.0), 200.0])
-        assert channel.elevation_deg(distance, 100.0) == pytest.approx([90.0, 45.0, 30.0])
+        assert channel.elevation_deg(horizontal, 100.0) == pytest.approx([90.0, 45.0, 30.0])
+        assert channel.elevation_deg(horizontal, 100.0) == pytest.approx(np.degrees(np.arcsin(100.0 / distance)))
 
 
 class TestLineOfSight:

@@ -30,10 +30,13 @@ def link_distance_m(horizontal_m: Array, altitude_m: float) -> Array:
     return xp.sqrt(horizontal_m * horizontal_m + altitude_m**2)
 
 
-def elevation_deg(distance_m: Array, altitude_m: float) -> Array:
-    """theta = arcsin(h / R), in degrees: the constants C and D of eq. (LoS_Prob) are in degrees."""
-    xp = array_namespace(distance_m)
-    return xp.asin(altitude_m / distance_m) * (180.0 / math.pi)
+def elevation_deg(horizontal_m: Array, altitude_m: float) -> Array:
+    """theta = arcsin(h / R), in degrees: the constants C and D of eq. (LoS_Prob) are in degrees.
+
+    Computed as 90 - arctan(d / h), for overhead the arcsine rounds badly and its slope is infinite.
+    """
+    xp = array_namespace(horizontal_m)
+    return 90.0 - xp.atan(horizontal_m * (1.0 / altitude_m)) * (180.0 / math.pi)
 
 
 def line_of_sight_probability(elevation: Array, channel: Channel) -> Array:
@@ -119,7 +122,7 @@ def transmission_s(packet_bits: Array, rate: Array) -> Array:
 def link_snr(horizontal_m: Array, channel: Channel) -> tuple[Array, Array, Array]:
     """From horizontal distance d (m) to (elevation in degrees, P_LoS, gamma without fading)."""
     distance = link_distance_m(horizontal_m, channel.altitude_m)
-    elevation = elevation_deg(distance, channel.altitude_m)
+    elevation = elevation_deg(horizontal_m, channel.altitude_m)
     los = line_of_sight_probability(elevation, channel)
     return elevation, los, mean_snr(mean_path_loss_db(distance, los, channel), channel)
 
