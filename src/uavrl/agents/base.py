@@ -23,7 +23,7 @@ class Batch:
     """B transitions."""
 
     observation: Observation  # (B, ...)
-    action: HybridAction  # executed: continuous (B, C) in [-1, 1], choice (B,) int64
+    action: HybridAction  # continuous (B, C) in [-1, 1], choice (B,) int64
     reward: Tensor  # (B,) as the agent is to see it, see `RewardConfig`
     duration_s: Tensor  # (B,)
     terminated: Tensor  # (B,) float, 1 where no future follows; a truncation is 0 and bootstraps
@@ -92,7 +92,7 @@ def discounts(batch: Batch, config: AgentConfig) -> Tensor:
 
 
 def bellman_loss(q: Tensor, target: Tensor, huber: float | None) -> Tensor:
-    """Half the squared error of both Q functions (2, B) to the target (B,), each a mean, summed; linear from `huber`."""
+    """Half the squared error of both Q (2, B) to the target (B,), each a mean, summed; linear from `huber` on."""
     wanted = target.expand_as(q)
     if huber is None:
         return 0.5 * functional.mse_loss(q, wanted, reduction="none").mean(dim=1).sum()
