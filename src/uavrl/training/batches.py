@@ -25,11 +25,11 @@ def spaces_of(scenario: Scenario, network_kind: str) -> Spaces:
     return Spaces(observation=flat, continuous=2, choices=devices + 1)
 
 
-def to_tensors(observation: Any) -> Observation:
+def to_tensors(observation: Any, device: torch.device | str = "cpu") -> Observation:
     """A NumPy observation of the simulator as float32 tensors."""
     if isinstance(observation, dict):
-        return {key: torch.from_numpy(np.ascontiguousarray(value)) for key, value in observation.items()}
-    return torch.from_numpy(np.ascontiguousarray(observation))
+        return {key: torch.from_numpy(np.ascontiguousarray(value)).to(device) for key, value in observation.items()}
+    return torch.from_numpy(np.ascontiguousarray(observation)).to(device)
 
 
 def to_batch(transitions: Transitions, kind: ObservationKind, scenario: Scenario) -> Batch:

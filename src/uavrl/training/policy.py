@@ -33,9 +33,10 @@ class AgentPolicy:
 
     def act(self, observation: Any, *, generator: np.random.Generator, deterministic: bool = False) -> FlightAction:
         """One action a flight; its torch generator is seeded from `generator`."""
-        draws = torch.Generator().manual_seed(int(generator.integers(2**62)))
-        action = self.agent.act(to_tensors(observation), generator=draws, deterministic=deterministic)
-        return FlightAction(action.continuous.double().numpy() * self.reach_m, action.choice.numpy())
+        device = next(self.agent.networks.parameters()).device
+        draws = torch.Generator(device).manual_seed(int(generator.integers(2**62)))
+        action = self.agent.act(to_tensors(observation, device), generator=draws, deterministic=deterministic)
+        return FlightAction(action.continuous.double().cpu().numpy() * self.reach_m, action.choice.cpu().numpy())
 
 
 def load_agent(checkpoint: Checkpoint, path: Path) -> Agent:
