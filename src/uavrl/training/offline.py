@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from uavrl.actions import HybridAction
 from uavrl.agents.base import Batch
@@ -98,8 +98,9 @@ class OfflineLearner:
             **{field.name: getattr(data, field.name) for field in fields(Batch) if field.name != "reward"},
             reward=transformed(data.reward, self.shift, factor, reward),
         )
-        torch.manual_seed(config.seed)
-        self.agent = make_agent(spaces_of(config.scenario, config.agent.network.kind), config.agent)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(config.seed)
+            self.agent = make_agent(spaces_of(config.scenario, config.agent.network.kind), config.agent)
         fit_normalisers(self.agent.networks, data.observation)
         self.agent.networks.to(self.device)
         self.data = _to(data, self.device)
@@ -207,7 +208,14 @@ class OfflineLearner:
         checkpoint = load_checkpoint(path)
         if checkpoint.document.get("kind") != "offline":
             raise CheckpointError(f"checkpoint '{path}' is of kind {checkpoint.document.get('kind')!r}, not 'offline'")
-        learner = cls(TrainConfig.model_validate(checkpoint.document["train"]), transitions, device)
+        try:
+            config = TrainConfig.model_validate(checkpoint.document["train"])
+            made_on = checkpoint.document["device"]
+        except (KeyError, ValidationError):
+            raise CheckpointError(f"checkpoint '{path}' holds no run of this version of uavrl") from None
+        if made_on != device:  # their generators differ
+            raise CheckpointError(f"checkpoint '{path}' was made with device = '{made_on}', go on with the same")
+        learner = cls(config, transitions, device)
         if learner.digest != checkpoint.document["data"]["sha256"]:
             raise CheckpointError(f"checkpoint '{path}' was trained on other data; give the same --data")
         restore_agent(learner.agent, checkpoint.tensors)

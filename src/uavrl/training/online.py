@@ -10,7 +10,7 @@ from typing import Literal
 import gymnasium
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from uavrl import ENVIRONMENT_ID
 from uavrl.agents.sac import Sac, SacConfig
@@ -19,7 +19,7 @@ from uavrl.datasets.transitions import Transitions, transition_columns
 from uavrl.errors import CheckpointError, ConfigError, DivergenceError
 from uavrl.evaluation.rollouts import EVALUATION_SEED, fixed_layout
 from uavrl.networks import fit_normalisers
-from uavrl.scenario import Scenario, parse_scenario
+from uavrl.scenario import Scenario
 from uavrl.simulation.environment import DataCollectionVectorEnv
 from uavrl.simulation.state import FlightAction, Outcome, SimState
 from uavrl.training.batches import OBSERVATION_OF, spaces_of, to_batch, to_tensors, transformed
@@ -77,8 +77,9 @@ class OnlineLearner:
         if not isinstance(environment.unwrapped, DataCollectionVectorEnv):
             raise ConfigError(f"{ENVIRONMENT_ID} is registered by another package")
         self.environment = environment.unwrapped
-        torch.manual_seed(config.seed)
-        self.agent = Sac(spaces_of(scenario, config.agent.network.kind), config.agent)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(config.seed)
+            self.agent = Sac(spaces_of(scenario, config.agent.network.kind), config.agent)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.numbers = np.random.default_rng([config.seed, 1])
         self.log = ReplayLog(scenario.traffic.devices, config.episodes * scenario.limits.max_steps)
@@ -230,8 +231,10 @@ class OnlineLearner:
         document, tensors = checkpoint.document, checkpoint.tensors
         if document.get("kind") != "online":
             raise CheckpointError(f"checkpoint '{path}' is of kind {document.get('kind')!r}, allowed: 'online'")
-        collect = dict(document["collect"])
-        learner = cls(CollectConfig(**{**collect, "scenario": parse_scenario(collect["scenario"])}))
+        try:
+            learner = cls(CollectConfig.model_validate(document["collect"]))
+        except (KeyError, ValidationError):
+            raise CheckpointError(f"checkpoint '{path}' holds no run of this version of uavrl") from None
         restore_agent(learner.agent, tensors)
         loop = {name: tensor.numpy() for name, tensor in tensors["loop"].items()}
         learner.log.load_state_dict({name: tensor.numpy() for name, tensor in tensors["log"].items()})
