@@ -39,9 +39,10 @@ class SacConfig(AgentConfig):
 
     name: Literal["sac"] = "sac"
     reward: RewardConfig = RewardConfig(transform="centred", clip=10.0)
-    batch_size: int = Field(256, ge=1, description="transitions an update")
+    batch_size: int = Field(128, ge=1, description="transitions an update")
     learning_rate: float = Field(6e-4, gt=0, description="of Adam")
-    discount: float = Field(0.99, ge=0, lt=1, description="gamma, per step or per second")
+    discount: float = Field(0.995, ge=0, lt=1, description="gamma; at .99 a flight to a better place barely pays")
+    huber: float | None = Field(None, gt=0, description="as in AgentConfig; online, plain squares learned well")
     continuous_entropy: float = Field(-2.0, description="target entropy of tanh w, H_c")
     choice_entropy: float = Field(0.3, ge=0, lt=1, description="target entropy of d, as a share of log D")
     initial_temperature: float = Field(0.1, gt=0, description="both temperatures at the start")
