@@ -15,7 +15,7 @@ DOCUMENTATION := tests/test_documentation.py
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup $(VENV) test test-all check format demo clean
+.PHONY: help setup $(VENV) test test-all check format demo data clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -62,6 +62,17 @@ format: $(STAMP)  ## mend what ruff can mend
 
 demo: $(STAMP)  ## learn a small policy from logged flights and watch it
 	$(BIN)/python -m uavrl demo $(DEMO_FLAGS)
+
+# The data that the package ships, remade: hours. `good` and `bad` are the last and first third of each training.
+data: $(STAMP)  ## collect the built-in data anew, with its good and bad parts, into runs/ (about an hour)
+	for name in fixed layouts; do \
+	  kind=$$([ $$name = fixed ] && echo fixed || echo random); \
+	  $(BIN)/uavrl collect --out runs/$$name --layouts $$kind --minari uavrl/$$name-v0 && \
+	  for quality in mixed good bad; do \
+	    size=$$([ $$quality = mixed ] && echo 50000 || echo 30000); \
+	    $(BIN)/uavrl data select runs/$$name/flights.parquet --size $$size --quality $$quality --out runs/$$name-$$quality.parquet || exit 1; \
+	  done || exit 1; \
+	done
 
 clean:  ## remove .venv, caches and builds
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist

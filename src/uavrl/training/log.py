@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -45,9 +45,10 @@ class Reporter(Protocol):
 
 
 @contextmanager
-def progress(title: str, total: int, unit: str) -> Iterator[Reporter]:
-    """Progress with rate and time left: a bar on a terminal, else a line every half minute on stderr."""
-    console = Console(stderr=True)
+def progress(title: str, total: int, unit: str, stream: TextIO | None = None) -> Iterator[Reporter]:
+    """Progress with rate and time left on `stream` (stderr): a bar on a terminal, else a line every half minute."""
+    stream = sys.stderr if stream is None else stream
+    console = Console(file=stream)
     started = time.monotonic()
     first: int | None = None
     if console.is_terminal:
@@ -81,6 +82,6 @@ def progress(title: str, total: int, unit: str) -> Iterator[Reporter]:
             last = now
             rate = (done - first) / max(now - started, 1e-9)
             left = f"{(total - done) / rate:,.0f} s left" if rate > 0 else "time left unknown"
-            print(f"{title}: {done:,}/{total:,} {unit}, {rate:,.0f}/s, {left}  {text}", file=sys.stderr, flush=True)
+            print(f"{title}: {done:,}/{total:,} {unit}, {rate:,.0f}/s, {left}  {text}", file=stream, flush=True)
 
     yield tell

@@ -1,0 +1,162 @@
+"""`uavrl demo`: the whole chain in minutes, from logged flights to a policy that is judged and shown."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+
+from uavrl.cli.settings import pydantic_config
+from uavrl.errors import ConfigError
+
+if TYPE_CHECKING:
+    from uavrl.evaluation.report import Judgement
+    from uavrl.evaluation.rollouts import EvaluationSet, Flights
+
+HEURISTICS = ("random_walk", "saver", "tdm", "max_age", "index", "hover", "planner")
+DATA = "layouts"
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Learn from the built-in flights, judge on layouts that nobody has seen, and show the result."""
+
+    out: Path = Path("out/demo")
+    """directory for summary.json, the table, figures, the page of a flight and the policy"""
+    updates: int = 4_500
+    """gradient steps of Diffusion-SAC; behaviour cloning takes as many"""
+    episodes: int = 100
+    """unseen layouts to judge on"""
+    seed: int = 0
+    """of weights, data order and noise"""
+
+    def run(self) -> None:
+        from uavrl.datasets import load_builtin
+        from uavrl.evaluation.report import judge
+        from uavrl.evaluation.rollouts import evaluation_set, fly
+        from uavrl.scenario import load_scenario
+
+        if self.episodes < 2:
+            raise ConfigError(f"--episodes {self.episodes}, allowed: 2 or more (an interval needs them)")
+        started = time.monotonic()
+        transitions = load_builtin(DATA)
+        scenario = load_scenario("released")
+        environments = evaluation_set(scenario, "random", self.episodes)
+        console = Console(stderr=True)
+        console.print(
+            f"Learning from {len(transitions):,} logged transitions; the planner flies meanwhile. "
+            "About eight minutes on two cores."
+        )
+        # a fresh interpreter: torch's threads do not survive a fork
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(1, mp_context=context, initializer=_single_thread) as side:
+            bc = side.submit(_train, "bc", self.out / "bc", self.updates, self.seed, False)
+            heuristics = {name: side.submit(_fly_heuristic, name, environments) for name in HEURISTICS}
+            _single_thread()
+            policy = _train("diffusion_sac", self.out / "policy", self.updates, self.seed, True)
+            flown = {"diffusion_sac": fly(policy, environments, name="diffusion_sac", show_progress=True)}
+            flown["bc"] = fly(bc.result(), environments, name="bc", show_progress=True)
+            console.print("Waiting for the planner's flights.")
+            flown |= {name: future.result() for name, future in heuristics.items()}
+        order = [*HEURISTICS, "bc", "diffusion_sac"]
+        judgement = judge(
+            {}, environments, flown={name: flown[name] for name in order}, data=transitions, command="uavrl demo"
+        )
+        _write(self.out, judgement)
+        _show(self.out, judgement, time.monotonic() - started)
+
+
+def _single_thread() -> None:
+    """Two processes share the machine: each keeps to one core."""
+    import torch
+
+    torch.set_num_threads(1)
+
+
+def _train(agent: str, out: Path, updates: int, seed: int, visible: bool) -> Any:
+    """Train afresh in `out` and return the policy; an earlier demo there is replaced when this one is saved."""
+    from uavrl.agents.registry import preset
+    from uavrl.cli.train import trial_flights
+    from uavrl.datasets import load_builtin
+    from uavrl.scenario import load_scenario
+    from uavrl.training.log import progress
+    from uavrl.training.offline import OfflineLearner, TrainConfig
+
+    transitions, scenario = load_builtin(DATA), load_scenario("released")
+    (out / "metrics.jsonl").unlink(missing_ok=True)
+    config = pydantic_config(
+        TrainConfig,
+        scenario=scenario,
+        agent=preset(agent, "default"),
+        updates=updates,
+        seed=seed,
+        save_every=max(1, updates // 4),
+        evaluate_every=max(1, updates // 6),
+        log_every=max(1, min(50, updates // 10)),
+    )
+    learner = OfflineLearner(config, transitions)
+    stream = sys.stderr if visible else open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # closed with its process
+    with progress(f"train {agent}", updates, "update", stream) as report:
+        return learner.run(out, report, trial_flights(transitions, scenario))
+
+
+def _fly_heuristic(name: str, environments: EvaluationSet) -> Flights:
+    from uavrl.evaluation.rollouts import fly
+    from uavrl.policies import make_policy
+
+    return fly(make_policy(name), environments, name=name)
+
+
+def _write(out: Path, judgement: Judgement) -> None:
+    """summary.json, the table, three figures and the page of a flight."""
+    from uavrl.evaluation.report import markdown_table, write_json, write_text
+    from uavrl.viewer.figures import age_bars, hero, objective_bars, training_curves, trajectories
+    from uavrl.viewer.page import write_page
+
+    write_json(out / "summary.json", judgement.report)
+    write_text(out / "table.md", markdown_table(judgement.report))
+    logs = {"diffusion_sac": out / "policy" / "metrics.jsonl", "bc": out / "bc" / "metrics.jsonl"}
+    training_curves(logs, out / "training.png")
+    age_bars(judgement.report, out / "age.png")
+    objective_bars(judgement.report, out / "return.png")
+    learned = judgement.flights["diffusion_sac"].episode(0)
+    trajectories([learned, judgement.flights["planner"].episode(0)], out / "trajectory.png")
+    hero(learned, out / "flight.png")
+    write_page(learned, out / "flight.html")
+
+
+def _show(out: Path, judgement: Judgement, seconds: float) -> None:
+    """The table, what was learned in two sentences, and what to type next."""
+    from uavrl.evaluation.report import rich_table
+
+    console = Console()
+    console.print(rich_table(judgement.report))
+    policies, paired = judgement.report["policies"], judgement.report["paired"]["diffusion_sac"]
+    own, excess = policies["diffusion_sac"]["return"], policies["diffusion_sac"]["excess_cost"]
+
+    def beside(name: str) -> str:
+        gap = paired[name]["return"]
+        clear = "better" if gap["low"] > 0 else "worse" if gap["high"] < 0 else "no different (95 %)"
+        return f"{clear} than {name} by {gap['mean']:+.0f} [{gap['low']:+.0f}, {gap['high']:+.0f}]"
+
+    print()
+    print(
+        f"From logged flights alone, Diffusion-SAC learned a policy with a return of {own['mean']:.0f} "
+        f"[{own['low']:.0f}, {own['high']:.0f}] on {judgement.report['episodes']} unseen layouts: {beside('tdm')}, "
+        f"{beside('bc')}, {beside('data')}."
+    )
+    print(
+        f"A planner that knows the physics returns {policies['planner']['return']['mean']:.0f}, so the learned policy "
+        f"costs {100 * excess['mean']:.0f} % [{100 * excess['low']:.0f}, {100 * excess['high']:.0f}] more than it."
+    )
+    print(f"\n{seconds / 60:.1f} minutes. In {out}: summary.json, table.md, *.png, flight.html, policy")
+    print(f"next: open {out / 'flight.html'} in a browser")
+    print(f"      uavrl watch {out / 'policy'} --layouts fixed")
+    print("      uavrl train diffusion_sac --out runs/longer")
