@@ -104,9 +104,10 @@ class DiffusionActor(nn.Module):
                 predicted: Tensor = self.average(context, vector, step)
                 return predicted
 
-            return decode(ddim(predict, schedule, start, None, clip_x0=self.config.clip_x0), self.continuous)
-        noise = ChainNoise.draw(count, size, self.config.steps, generator)
-        return decode(self.sample(self.average, context, noise), self.continuous)
+            vector = ddim(predict, schedule, start, None, clip_x0=self.config.clip_x0)
+        else:
+            vector = self.sample(self.average, context, ChainNoise.draw(count, size, self.config.steps, generator))
+        return decode(self.average.possible(context, vector), self.continuous)
 
 
 def block_mean(error: Tensor, continuous: int, weight: float) -> Tensor:

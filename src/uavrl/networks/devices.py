@@ -186,6 +186,11 @@ class SetDenoiser(Denoiser):
         """C + K + 1 for this observation's K."""
         return self.continuous + 1 + context[2].shape[1]
 
+    def possible(self, context: Context, vector: Tensor) -> Tensor:
+        """See `Denoiser`."""
+        first = self.continuous + 1
+        return torch.cat([vector[:, :first], torch.where(context[2] > 0, vector[:, first:], NEVER)], dim=1)
+
 
 class SetActor(Actor):
     """Gaussian over the displacement from the global vector, a logit a device from its token."""

@@ -63,6 +63,10 @@ class Denoiser(nn.Module, ABC):
     def vector_size(self, context: Context) -> int:
         """C + D for this observation."""
 
+    def possible(self, context: Context, vector: Tensor) -> Tensor:
+        """A diffusion vector (B, C + D) with the entries of padded devices out of an argmax's reach."""
+        return vector
+
 
 class Actor(nn.Module, ABC):
     """pi(w, d | s) of the Gaussian-categorical agents."""
