@@ -65,6 +65,8 @@ class OnlineLearner:
         scenario = config.scenario
         if scenario.limits.max_steps is None:
             raise ConfigError("limits.max_steps is none, collecting needs a number of steps to size its log")
+        if config.agent.reward.transform == "zscore":
+            raise ConfigError("reward.transform = 'zscore' needs all data, allowed while collecting: 'centred', 'none'")
         self.kind = OBSERVATION_OF[config.agent.network.kind]
         environment = gymnasium.make_vec(
             ENVIRONMENT_ID,
