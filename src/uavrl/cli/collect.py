@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from uavrl.cli.settings import pydantic_config, with_settings
+from uavrl.cli.settings import output_directory, pydantic_config, with_settings
 from uavrl.errors import ConfigError
 from uavrl.scenario import load_scenario
 
@@ -54,6 +54,7 @@ class Collect:
             episodes=self.episodes,
             seed=self.seed,
         )
+        output_directory(self.out)
         learner = OnlineLearner.resume(self.out)
         if learner is None:
             learner = OnlineLearner(config)

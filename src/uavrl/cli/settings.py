@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -53,3 +54,15 @@ def pydantic_config(kind: type[Config], **values: Any) -> Config:
         return kind(**values)
     except ValidationError as error:
         raise ConfigError(describe_validation(error, "setting")) from None
+
+
+def output_directory(path: Path) -> None:
+    """Make a run's directory now, rather than fail to after an hour.
+
+    Raises:
+        ConfigError: it is a file, or cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--out '{path}' cannot be made, allowed: a directory ({error.strerror})") from None

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 import tyro
 
-from uavrl.cli.settings import pydantic_config, with_settings
+from uavrl.cli.settings import output_directory, pydantic_config, with_settings
 from uavrl.errors import ConfigError
 from uavrl.scenario import Scenario
 
@@ -76,6 +76,7 @@ class Train:
             seed=self.seed,
             evaluate_every=self.evaluate_every,
         )
+        output_directory(self.out)
         learner = OfflineLearner.resume(self.out, transitions, self.device) if self.resume else None
         if self.resume and learner is None:
             raise ConfigError(f"--resume: '{self.out}' holds no checkpoint")
