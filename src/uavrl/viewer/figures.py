@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,15 +19,14 @@ from numpy.typing import NDArray
 from uavrl.errors import ConfigError
 from uavrl.evaluation.episode import Episode
 from uavrl.physics.age import age_integral_s2
-from uavrl.simulation.rendering import AGE_COLOURS, BLUE, INK, dot_points, draw_area, numbered
+from uavrl.simulation.rendering import AGE_COLOURS, BLUE, INK, draw_area, numbered
 
 Float = NDArray[np.float64]
 
 TIME_COLOURS = "viridis"  # safe for colour-blind readers, as the palette below (Okabe & Ito 2008)
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#222222")
-_GREY = "#9a9a9a"
 _DPI = 150
-_CUT = 4.0  # a bar longer than this many median bars is cut, or the others could not be compared
+_CUT = 5.0  # a bar this many times as long as the lower quartile is cut, or the others could not be compared
 _SMOOTH = 0.05  # share of a noisy curve that its running mean spans
 
 AGE_METRICS = {
@@ -63,7 +63,9 @@ def training_curves(logs: Mapping[str, Path], out: Path) -> None:
         values = [
             _curve(axes, rows, key, PALETTE[i % len(PALETTE)], name) for i, (name, rows) in enumerate(runs.items())
         ]
-        axes.set_title({"return": "return of a flight", "q": "Q, mean over the batch"}.get(key, key.replace("_", " ")))
+        axes.set_title(
+            {"return": "return of the trial flights", "q": "Q, mean over the batch"}.get(key, key.replace("_", " "))
+        )
         axes.set_xlabel("step")
         axes.grid(color="#ececec", linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
@@ -97,17 +99,16 @@ def _read_log(path: Path) -> list[dict[str, Any]]:
 
 
 def _curve(axes: Axes, rows: Sequence[Mapping[str, Any]], key: str, colour: str, name: str) -> Float:
-    """Draw one run's values of a key, a noisy one faint under its running mean. Returns the values."""
+    """Draw one run's values of a key, a long series faint under its running mean. Returns the values."""
     chosen = [row for row in rows if key in row]
     steps, values = np.array([row["step"] for row in chosen]), np.array([row[key] for row in chosen], dtype=np.float64)
     if len(values) <= 40:
         axes.plot(steps, values, color=colour, linewidth=1.8, marker="o", markersize=4, label=name)
         return values
     axes.plot(steps, values, color=colour, linewidth=0.8, alpha=0.25)
-    width = max(3, int(_SMOOTH * len(values)))
-    total = np.cumsum(np.concatenate([[0.0], values]))
-    last = np.arange(1, len(values) + 1)
-    first = np.maximum(last - width, 0)
+    half = max(1, int(0.5 * _SMOOTH * len(values)))
+    total, index = np.concatenate([[0.0], np.cumsum(values)]), np.arange(len(values))
+    first, last = np.maximum(index - half, 0), np.minimum(index + half + 1, len(values))
     axes.plot(steps, (total[last] - total[first]) / (last - first), color=colour, linewidth=1.8, label=name)
     return values
 
@@ -129,7 +130,7 @@ def objective_bars(report: Mapping[str, Any], out: Path) -> None:
 def metric_bars(report: Mapping[str, Any], metrics: Mapping[str, str], out: Path) -> None:
     """A panel a metric, a bar a policy with its 95 % interval, the numbers beside it.
 
-    Bars of more than four times the median length are cut, and drawn pale: their numbers say how long they are.
+    Bars of more than five times the lower quartile of the lengths are cut and hatched: their numbers stand beside.
 
     Args:
         report: JSON of an evaluation, `policies.<name>.<metric>.{mean,low,high}`.
@@ -147,14 +148,17 @@ def metric_bars(report: Mapping[str, Any], metrics: Mapping[str, str], out: Path
     left_in, panel_in, height_in = 0.35 + 0.085 * min(longest, 40), 4.3, 0.27 * len(policies)
     width_in = left_in + panel_in * len(shown)
     figure = Figure(figsize=(width_in, height_in + 1.0), dpi=_DPI)
+    cut = False
     for index, metric in enumerate(shown):
         bottom = 0.35 / (height_in + 1.0)
         place = (left_in + panel_in * index) / width_in, bottom, 2.6 / width_in, height_in / (height_in + 1.0)
         axes = figure.add_axes(place)
         rows = [_interval(row.get(metric)) for row in policies.values()]
-        _bars(axes, rows, _SCALE.get(metric, 1.0))
+        cut = _bars(axes, rows, _SCALE.get(metric, 1.0)) or cut
         axes.set_title(metrics[metric], fontsize=11, loc="left", pad=8)
         axes.set_yticks(range(len(policies)), [_short(name) for name in policies] if index == 0 else [])
+    note = "whiskers and brackets: 95 % interval" + ("; hatched: the bar is cut" if cut else "")
+    figure.axes[0].set_xlabel(note, fontsize=8, color="#707070", loc="left")
     _save(figure, out)
 
 
@@ -167,11 +171,12 @@ def _interval(value: Mapping[str, float | None] | None) -> tuple[float, float, f
     return (present[0], present[1], present[2]) if len(present) == 3 else None
 
 
-def _bars(axes: Axes, rows: Sequence[tuple[float, float, float] | None], scale: float) -> None:
+def _bars(axes: Axes, rows: Sequence[tuple[float, float, float] | None], scale: float) -> bool:
+    """Draw a panel of bars, None where a policy has no value. Returns whether one was cut."""
     present = np.array([row for row in rows if row is not None]) * scale
     lengths = np.abs(present[:, 0])
-    limit = _CUT * float(np.median(lengths[lengths > 0])) if (lengths > 0).any() else 1.0
-    kept = present[lengths <= limit]  # at least the median one, or the zeros
+    limit = _CUT * float(np.quantile(lengths[lengths > 0], 0.25)) if (lengths > 0).any() else 1.0
+    kept = present[lengths <= limit]  # not empty: the shortest is among them
     low, high = min(0.0, float(kept.min())), max(0.0, float(kept.max()))
     pad = 0.06 * ((high - low) or 1.0)
     axes.set_xlim(low - pad if low < 0 else 0.0, high + pad if high > 0 else 0.0)
@@ -180,13 +185,14 @@ def _bars(axes: Axes, rows: Sequence[tuple[float, float, float] | None], scale: 
             text = "-"
         else:
             mean, below, above = (number * scale for number in row)
-            cut = abs(mean) > limit
-            axes.barh(place, mean, 0.68, color=BLUE, alpha=0.25 if cut else 0.8, hatch="///" if cut else None)
-            if not cut:
+            over = abs(mean) > limit
+            hatch: dict[str, Any] = {"hatch": "////", "edgecolor": "white", "linewidth": 0.0} if over else {}
+            axes.barh(place, mean, 0.68, color=BLUE, alpha=0.4 if over else 0.8, **hatch)
+            if not over:
                 # a bootstrap interval of a skewed sample may leave out its own mean
                 spread = [[max(mean - below, 0.0)], [max(above - mean, 0.0)]]
                 axes.errorbar(mean, place, xerr=spread, color=INK, capsize=3, linewidth=1.2)
-            text = f"{_digits(mean)} [{_digits(below)}, {_digits(above)}]"
+            text = f"{_digits(mean, limit)} [{_digits(below, limit)}, {_digits(above, limit)}]"
         axes.text(1.03, place, text, transform=axes.get_yaxis_transform(), va="center", fontsize=9, color=INK)
     axes.set_ylim(len(rows) - 0.4, -0.6)  # the first on top
     axes.locator_params(axis="x", nbins=5)
@@ -195,11 +201,15 @@ def _bars(axes: Axes, rows: Sequence[tuple[float, float, float] | None], scale: 
     axes.tick_params(axis="y", length=0)
     axes.grid(axis="x", color="#ececec", linewidth=0.6)
     axes.set_axisbelow(True)
+    return bool((lengths > limit).any())
 
 
-def _digits(value: float) -> str:
-    """Three significant digits, more for whole numbers, no exponent."""
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
+def _digits(value: float, scale: float) -> str:
+    """Three significant digits, none beyond a thousandth of `scale`, no exponent."""
+    finest = max(0, 3 - math.floor(math.log10(scale)))
+    decimals = max(0, 2 - math.floor(math.log10(abs(value)))) if value else 0
+    text = f"{value:.{min(decimals, finest)}f}"
+    return text if float(text) else "0"
 
 
 def _short(name: str) -> str:
@@ -215,7 +225,9 @@ def trajectories(episodes: Sequence[Episode], out: Path) -> None:
     if not episodes:
         raise ConfigError("episodes is empty, needed: 1 or more")
     count = len(episodes)
-    figure = Figure(figsize=(4.4 * count + 0.9, 4.7), dpi=_DPI, layout="constrained")
+    tallest = max(episode.scenario.area.depth_m / episode.scenario.area.width_m for episode in episodes)
+    height_in = 1.2 + 3.9 * min(tallest, 1.5)
+    figure = Figure(figsize=(4.4 * count + 0.9, height_in), dpi=_DPI, layout="constrained")
     panels = figure.subplots(1, count, squeeze=False, sharex=True, sharey=True)[0]
     norm = Normalize(0.0, max(float(episode.time_s[-1]) for episode in episodes))
     for index, (axes, episode) in enumerate(zip(panels, episodes, strict=True)):
@@ -230,39 +242,30 @@ def trajectories(episodes: Sequence[Episode], out: Path) -> None:
 
 
 def hero(episode: Episode, out: Path) -> None:
-    """A flight at a glance, 1600 pixels wide: its map, and every device's age over time.
+    """A flight at a glance, about 1600 pixels wide: its map, and every device's age over time.
 
     Raises:
         ConfigError: `out` cannot be written.
     """
-    oldest_s = max(float(np.percentile(episode.age_s, 98)), 1e-9)
-    norm = Normalize(0.0, oldest_s)
-    mean_age_s = _device_ages_s(episode)
-    figure = Figure(figsize=(8.0, 3.9), dpi=200, layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.05])
-    draw_area(left, episode.scenario)
+    norm = Normalize(0.0, max(float(np.percentile(episode.age_s, 98)), 1e-9))
     colours = ScalarMappable(norm, AGE_COLOURS)
-    dark = [float(norm(age)) > 0.6 for age in mean_age_s]
-    _dots(left, episode, colours.to_rgba(mean_age_s), ["white" if is_dark else INK for is_dark in dark], 2.9)
-    time_norm = Normalize(0.0, float(episode.time_s[-1]))
-    _path(left, episode, time_norm)
-    left.set_title("flight, and mean age of each device", fontsize=10)
+    mean_age_s = _device_ages_s(episode)
+    figure = Figure(figsize=(8.0, 3.7), dpi=200, layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.15])
+    draw_area(left, episode.scenario)
+    inks = ["white" if norm(age) > 0.6 else INK for age in mean_age_s]
+    _dots(left, episode, colours.to_rgba(mean_age_s), inks, 2.9)
+    _path(left, episode)
+    left.set_title(f"{_short(episode.policy)}: flight, mean age of each device", fontsize=10)
     devices = len(episode.layout_m)
-    right.pcolormesh(
-        episode.time_s,
-        np.arange(devices + 1) + 0.5,
-        episode.age_s[1:].T,
-        norm=norm,
-        cmap=AGE_COLOURS,
-        rasterized=True,
-    )
+    rows = np.arange(devices + 1) + 0.5
+    right.pcolormesh(episode.time_s, rows, episode.age_s[1:].T, norm=norm, cmap=AGE_COLOURS)
     right.set(xlabel="time (s)", ylabel="device")
     right.set_ylim(devices + 0.5, 0.5)
     if devices <= 20:
         right.set_yticks(range(1, devices + 1))
     right.set_title("age of information over time", fontsize=10)
     figure.colorbar(colours, ax=right, label="age (s)", extend="max", pad=0.02)
-    figure.colorbar(ScalarMappable(time_norm, TIME_COLOURS), ax=left, label="time (s)", shrink=0.85, pad=0.02)
     _save(figure, out)
 
 
@@ -275,10 +278,12 @@ def _device_ages_s(episode: Episode) -> Float:
 
 
 def _dots(axes: Axes, episode: Episode, faces: Any, inks: Any, side_in: float) -> None:
-    """Devices as numbered dots on a map of about `side_in` inches."""
-    layout, points = episode.layout_m, 0.9 * dot_points(len(episode.layout_m))
-    axes.scatter(layout[:, 0], layout[:, 1], s=points**2, c=faces, edgecolors=INK, linewidths=0.9, zorder=3)
-    side_m = max(episode.scenario.area.width_m, episode.scenario.area.depth_m)
+    """Devices as numbered dots on a map whose longer side is about `side_in` inches."""
+    layout, area = episode.layout_m, episode.scenario.area
+    side_m = max(area.width_m, area.depth_m)
+    map_points = 72.0 * side_in * np.sqrt(area.width_m * area.depth_m) / side_m
+    points = float(np.clip(0.3 * map_points / np.sqrt(len(layout)), 4.0, 15.0))
+    axes.scatter(layout[:, 0], layout[:, 1], s=points**2, c=faces, edgecolors=INK, linewidths=0.8, zorder=3)
     for device in numbered(layout, 0.85 * points * side_m / (72.0 * side_in)):
         axes.text(
             layout[device, 0],
@@ -292,20 +297,24 @@ def _dots(axes: Axes, episode: Episode, faces: Any, inks: Any, side_in: float) -
         )
 
 
-def _path(axes: Axes, episode: Episode, norm: Normalize) -> None:
-    """The trajectory coloured by time, its start and its end."""
-    position = episode.position_m
-    pieces = np.stack([position[:-1], position[1:]], axis=1)
-    axes.add_collection(
-        LineCollection(list(pieces), array=episode.time_s[:-1], cmap=TIME_COLOURS, norm=norm, linewidths=2.2, zorder=5)
-    )
-    ends = ScalarMappable(norm, TIME_COLOURS).to_rgba(episode.time_s[[0, -1]])
-    axes.plot(*position[0], marker="s", markersize=8, color=ends[0], markeredgecolor="white", zorder=6)
-    axes.plot(*position[-1], marker="X", markersize=10, color=ends[1], markeredgecolor=INK, zorder=7)
+def _path(axes: Axes, episode: Episode, norm: Normalize | None = None) -> None:
+    """The trajectory, coloured by time if `norm` says how, with its start (square) and its end (cross)."""
+    position, colours = episode.position_m, [BLUE, BLUE]
+    if norm is None:
+        axes.plot(position[:, 0], position[:, 1], color=BLUE, linewidth=2.2, zorder=5)
+    else:
+        pieces = list(np.stack([position[:-1], position[1:]], axis=1))
+        lines = LineCollection(
+            pieces, array=episode.time_s[:-1], cmap=TIME_COLOURS, norm=norm, linewidths=2.2, zorder=5
+        )
+        axes.add_collection(lines)
+        colours = list(ScalarMappable(norm, TIME_COLOURS).to_rgba(episode.time_s[[0, -1]]))
+    axes.plot(*position[0], marker="s", markersize=11, color="none", markeredgecolor=colours[0], mew=2.0, zorder=6)
+    axes.plot(*position[-1], marker="X", markersize=10, color=colours[1], markeredgecolor=INK, mew=0.8, zorder=7)
 
 
 def _save(figure: Figure, out: Path) -> None:
     try:
-        figure.savefig(out, format="png")
+        figure.savefig(out, format="png", bbox_inches="tight", pad_inches=0.1)
     except OSError as error:
         raise ConfigError(f"file '{out}' cannot be written: {error.strerror}") from None

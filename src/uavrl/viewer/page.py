@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
+import plotly.io
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
@@ -23,6 +24,9 @@ _FRAME_MS = 100
 _CORNERS = 400  # of the drawn trajectory; a longer flight's is thinned, or its frames would outgrow the page
 _DARK = 0.6  # share of the colour scale from which a number on it must be white
 _GREY = "#8a8a8a"
+_MAP, _AGES, _MEANS, _ENERGY = (1, 1), (1, 2), (2, 2), (3, 2)  # (row, column) of the subplots
+
+Placed = tuple[tuple[int, int], dict[str, Any]]  # a subplot and a trace in it
 
 
 def shown_steps(steps: int, frames: int = FRAMES) -> NDArray[np.int64]:
@@ -44,14 +48,14 @@ def mean_ages_s(episode: Episode) -> tuple[Float, Float]:
     return episode.age_s @ weight, np.concatenate([[0.0], integral / episode.time_s[1:]])
 
 
-def episode_figure(episode: Episode, frames: int = FRAMES) -> go.Figure:
-    """The flight as an animated plotly figure of at most `frames` frames, `frames` >= 2.
+def episode_figure(episode: Episode, frames: int = FRAMES) -> dict[str, Any]:
+    """The flight as an animated plotly figure, {"data", "layout", "frames"}, of at most `frames` frames, `frames` >= 2.
 
     Map, ages as bars, mean age over time and energy over time; play and pause buttons and a slider.
     """
     shown = shown_steps(episode.steps, frames)
     scene = _Scene(episode, shown)
-    still, moving = scene.still(), [scene.moving(int(step)) for step in shown]
+    still, moving = scene.still(), [scene.moving(step) for step in shown.tolist()]
     figure = make_subplots(
         rows=3,
         cols=2,
@@ -64,14 +68,25 @@ def episode_figure(episode: Episode, frames: int = FRAMES) -> go.Figure:
     for traces in (still, moving[0]):
         for (row, column), trace in traces:
             figure.add_trace(trace, row=row, col=column)
-    changing = list(range(len(still), len(still) + len(moving[0])))
-    figure.frames = [
-        go.Frame(name=str(step), data=[trace for _, trace in traces], traces=changing)
-        for step, traces in zip(shown, moving, strict=True)
-    ]
     figure.update_layout(**scene.layout())
     scene.axes(figure)
-    return figure
+    figure.update_xaxes(title_font_size=13, title_standoff=6)
+    figure.update_yaxes(title_font_size=13, title_standoff=8)
+    # as plain data: plotly would spend seconds on validating every frame as it has the first
+    changing = list(range(len(still), len(still) + len(moving[0])))
+    played = [
+        {"name": str(step), "data": [trace for _, trace in traces], "traces": changing}
+        for step, traces in zip(shown.tolist(), moving, strict=True)
+    ]
+    return {**figure.to_plotly_json(), "frames": played}
+
+
+def _dots(points: Float, mode: str = "markers", **style: Any) -> dict[str, Any]:
+    return {"type": "scatter", "x": points[:, 0].tolist(), "y": points[:, 1].tolist(), "mode": mode, **style}
+
+
+def _line(points: Float, line: dict[str, Any], **style: Any) -> dict[str, Any]:
+    return _dots(points, mode="lines", line=line, hoverinfo="skip", **style)
 
 
 class _Scene:
@@ -92,115 +107,88 @@ class _Scene:
         labelled = numbered(episode.layout_m, 0.85 * self.dot_px * self.side_m / 500.0)  # a map of about 500 px
         self.numbers = [str(k + 1) if k in labelled else "" for k in range(devices)]
 
-    def still(self) -> list[tuple[tuple[int, int], Any]]:
+    def still(self) -> list[Placed]:
         """What does not change: the start, and the curves over time."""
-        episode, time_s = self.episode, np.round(self.episode.time_s[self.shown], 2).tolist()
-        start = go.Scatter(
-            x=episode.position_m[:1, 0].round(1).tolist(),
-            y=episode.position_m[:1, 1].round(1).tolist(),
-            mode="markers",
-            marker={"symbol": "square-open", "size": 11, "color": BLUE, "line": {"width": 2}},
-            name="start",
-            hovertemplate="start<br>%{x} m, %{y} m<extra></extra>",
-        )
-
-        def curve(values: Float, name: str, unit: str, colour: str) -> Any:
-            return go.Scatter(
-                x=time_s,
-                y=values[self.shown].round(4).tolist(),
-                mode="lines",
-                line={"color": colour, "width": 1.6},
-                name=name,
-                hovertemplate=f"%{{x}} s: %{{y:.3g}} {unit}<extra>{name}</extra>",
-            )
-
+        joules, unit = self.joules
         return [
-            ((1, 1), start),
-            ((2, 2), curve(self.mean_age_s, "now", "s", _GREY)),
-            ((2, 2), curve(self.running_age_s, "mean since the start", "s", BLUE)),
-            ((3, 2), curve(self.used_j / self.joules[0], "energy used", self.joules[1], BLUE)),
+            (
+                _MAP,
+                _dots(
+                    self.episode.position_m[:1].round(1),
+                    marker={"symbol": "square-open", "size": 11, "color": BLUE, "line": {"width": 2}},
+                    hovertemplate="start<br>%{x} m, %{y} m<extra></extra>",
+                ),
+            ),
+            (_MEANS, self._curve(self.mean_age_s, "now", "s", _GREY)),
+            (_MEANS, self._curve(self.running_age_s, "mean since the start", "s", BLUE)),
+            (_ENERGY, self._curve(self.used_j / joules, "energy used", unit, BLUE)),
         ]
 
-    def moving(self, step: int) -> list[tuple[tuple[int, int], Any]]:
+    def moving(self, step: int) -> list[Placed]:
         """What changes, as after `step` steps: path, link, devices, aircraft, bars, and a dot on each curve."""
         episode = self.episode
-        here, ages = episode.position_m[step], episode.age_s[step].round(2)
+        here, ages = episode.position_m[step : step + 1].round(1), episode.age_s[step].round(2)
         path = episode.position_m[np.append(self.corners[self.corners < step], step)].round(1)
         device = int(episode.device[step - 1]) if step > 0 else 0
-        link = np.stack([here, episode.layout_m[device - 1]]).round(1) if device > 0 else np.empty((0, 2))
+        link = np.concatenate([here, episode.layout_m[device - 1 : device].round(1)]) if device > 0 else here[:0]
         arrived = step > 0 and bool(episode.served[step - 1])
-        outlines = [3.0 if k + 1 == device else 1.0 for k in range(len(ages))]
+        devices = np.arange(1, len(ages) + 1)
         colours = {"color": ages.tolist(), "coloraxis": "coloraxis"}
-        clock = round(float(episode.time_s[step]), 2)
-        devices = list(range(1, len(ages) + 1))
-
-        def dot(values: Float, colour: str) -> Any:
-            marker = {"size": 9, "color": colour, "line": {"color": "white", "width": 1.5}}
-            return go.Scatter(
-                x=[clock], y=[round(float(values[step]), 4)], mode="markers", marker=marker, hoverinfo="skip"
-            )
-
+        outlines = np.where(devices == device, 3.0, 1.0).tolist()
+        inks = np.where(ages > _DARK * self.oldest_s, "white", INK).tolist()
         return [
+            (_MAP, _line(path, {"color": BLUE, "width": 2.2}, opacity=0.75)),
             (
-                (1, 1),
-                go.Scatter(
-                    x=path[:, 0].tolist(),
-                    y=path[:, 1].tolist(),
-                    mode="lines",
-                    line={"color": BLUE, "width": 2.2},
-                    opacity=0.75,
-                    hoverinfo="skip",
+                _MAP,
+                _line(
+                    link, {"color": INK, "width": 2.4} if arrived else {"color": VERMILION, "width": 2.4, "dash": "dot"}
                 ),
             ),
             (
-                (1, 1),
-                go.Scatter(
-                    x=link[:, 0].tolist(),
-                    y=link[:, 1].tolist(),
-                    mode="lines",
-                    line={"color": INK if arrived else VERMILION, "width": 2.4, "dash": "solid" if arrived else "dot"},
-                    hoverinfo="skip",
-                ),
-            ),
-            (
-                (1, 1),
-                go.Scatter(
-                    x=episode.layout_m[:, 0].round(1).tolist(),
-                    y=episode.layout_m[:, 1].round(1).tolist(),
+                _MAP,
+                _dots(
+                    episode.layout_m.round(1),
                     mode="markers+text",
-                    marker=colours | {"size": self.dot_px, "line": {"color": INK, "width": outlines}, "opacity": 1.0},
+                    marker=colours | {"size": self.dot_px, "opacity": 1.0, "line": {"color": INK, "width": outlines}},
                     text=self.numbers,
-                    textfont={
-                        "size": 11,
-                        "color": ["white" if age > _DARK * self.oldest_s else INK for age in ages],
-                    },
-                    customdata=devices,
+                    textfont={"size": 11, "color": inks},
+                    customdata=devices.tolist(),
                     hovertemplate="device %{customdata}<br>%{x} m, %{y} m<br>age %{marker.color} s<extra></extra>",
                 ),
             ),
             (
-                (1, 1),
-                go.Scatter(
-                    x=[round(float(here[0]), 1)],
-                    y=[round(float(here[1]), 1)],
-                    mode="markers",
+                _MAP,
+                _dots(
+                    here,
                     marker={"symbol": "x", "size": 15, "color": BLUE, "line": {"color": "white", "width": 1.5}},
                     hovertemplate="aircraft<br>%{x} m, %{y} m<extra></extra>",
                 ),
             ),
             (
-                (1, 2),
-                go.Bar(
-                    x=devices,
-                    y=ages.tolist(),
-                    marker=colours | {"line": {"color": INK, "width": 0.6 if len(ages) <= 40 else 0.0}},
-                    hovertemplate="device %{x}: %{y} s<extra></extra>",
-                ),
+                _AGES,
+                {
+                    "type": "bar",
+                    "x": devices.tolist(),
+                    "y": ages.tolist(),
+                    "marker": colours | {"line": {"color": INK, "width": 0.6 if len(ages) <= 40 else 0.0}},
+                    "hovertemplate": "device %{x}: %{y} s<extra></extra>",
+                },
             ),
-            ((2, 2), dot(self.mean_age_s, _GREY)),
-            ((2, 2), dot(self.running_age_s, BLUE)),
-            ((3, 2), dot(self.used_j / self.joules[0], BLUE)),
+            (_MEANS, self._now(step, self.mean_age_s, _GREY)),
+            (_MEANS, self._now(step, self.running_age_s, BLUE)),
+            (_ENERGY, self._now(step, self.used_j / self.joules[0], BLUE)),
         ]
+
+    def _curve(self, values: Float, name: str, unit: str, colour: str) -> dict[str, Any]:
+        points = np.stack([self.episode.time_s[self.shown].round(2), values[self.shown].round(4)], axis=1)
+        shape = {"color": colour, "width": 1.6}
+        label = f"%{{x}} s: %{{y:.3g}} {unit}<extra>{name}</extra>"
+        return _line(points, shape) | {"hoverinfo": "x+y", "hovertemplate": label}
+
+    def _now(self, step: int, values: Float, colour: str) -> dict[str, Any]:
+        point = np.array([[self.episode.time_s[step].round(2), values[step].round(4)]])
+        marker = {"size": 9, "color": colour, "line": {"color": "white", "width": 1.5}}
+        return _dots(point, marker=marker, hoverinfo="skip")
 
     @property
     def joules(self) -> tuple[float, str]:
@@ -247,9 +235,9 @@ class _Scene:
                     "direction": "right",
                     "x": 0.0,
                     "xanchor": "left",
-                    "y": -0.09,
+                    "y": 0.0,
                     "yanchor": "top",
-                    "pad": {"t": 34, "r": 10},
+                    "pad": {"t": 84, "r": 10},
                     "showactive": False,
                     "buttons": [
                         {"label": "&#9654; Play", "method": "animate", "args": [None, play]},
@@ -262,9 +250,9 @@ class _Scene:
                     "active": 0,
                     "x": 0.17,
                     "len": 0.83,
-                    "y": -0.09,
+                    "y": 0.0,
                     "yanchor": "top",
-                    "pad": {"t": 6, "b": 6},
+                    "pad": {"t": 56, "b": 6},
                     "ticklen": 0,
                     "minorticklen": 0,
                     "font": {"color": "rgba(0,0,0,0)", "size": 1},  # a label a step would overlap: the readout has it
@@ -331,7 +319,7 @@ _PAGE = """<!DOCTYPE html>
   main {{ min-width: 940px; max-width: 1500px; margin: 0 auto; }}
   h1 {{ font-size: 22px; margin: 0 0 4px; overflow-wrap: anywhere; }}
   p {{ font-size: 14px; line-height: 1.45; margin: 0 0 6px; color: #444; }}
-  .flight {{ height: max(620px, calc(100vh - 130px)); max-height: 900px; }}
+  .flight {{ height: max(620px, calc(100vh - 150px)); max-height: 900px; }}
 </style>
 </head>
 <body>
@@ -357,6 +345,7 @@ def episode_page(episode: Episode, frames: int = FRAMES) -> str:
     if episode.steps == 0:
         raise ConfigError(f"the flight of '{episode.policy}' has no step to show")
     figure = episode_figure(episode, frames)
+    oldest_s = figure["layout"]["coloraxis"]["cmax"]
     stride = int(np.diff(shown_steps(episode.steps, frames)).max())
     mean, running = mean_ages_s(episode)
     packets = int((episode.device > 0).sum())
@@ -373,11 +362,13 @@ def episode_page(episode: Episode, frames: int = FRAMES) -> str:
             f"over steps; {episode.energy_j.sum():.4g} J used."
         ),
         legend=(
-            f"Dots are devices, coloured by the age of their information (darkest: "
-            f"{figure.layout.coloraxis.cmax:g} s or more). Cross: the aircraft; square: its start; blue line: where it "
-            "has been. Black line: the device that it has just served; dotted: a packet that was lost."
+            f"Dots are devices, coloured by the age of their information (darkest: {oldest_s:g} s or more). "
+            "Cross: the aircraft; square: its start; blue line: where it has been. "
+            "Black line: the device that it has just served; dotted: a packet that was lost."
         ),
-        figure=figure.to_html(
+        figure=plotly.io.to_html(
+            figure,
+            validate=False,
             full_html=False,
             include_plotlyjs=True,
             auto_play=False,
