@@ -452,9 +452,10 @@ def nearest(state: SimState, layout: Float, step: int) -> FlightAction:
 class TestReferenceFigures:
     """Returns that were measured on the paper's system with an independent implementation."""
 
-    @pytest.mark.parametrize(("name", "expected"), [("paper", -2.005), ("released", -802.0)])
+    @pytest.mark.parametrize(("name", "expected"), [("paper", -2.005), ("released", -802.0), ("realistic", -40200.0)])
     def test_idling_for_ever(self, name: str, expected: float) -> None:
-        assert returns(load_scenario(name), idle, count=2) == pytest.approx([expected] * 2, rel=1e-9)
+        late = 1e-3 if name == "realistic" else 1e-9  # rounding of the clock may add a step of 0.1 s
+        assert returns(load_scenario(name), idle, count=2) == pytest.approx([expected] * 2, rel=late)
 
     def test_round_robin_on_released(self) -> None:
         assert returns(load_scenario("released"), round_robin).mean() == pytest.approx(-299.0, abs=30.0)
