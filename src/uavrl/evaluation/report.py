@@ -19,7 +19,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-import uavrl
+from uavrl import __version__
 from uavrl.datasets.transitions import Transitions
 from uavrl.errors import ConfigError
 from uavrl.evaluation.behaviour import behaviour
@@ -266,7 +266,7 @@ def returns_of_duty(scenario: Scenario, every: Sequence[int]) -> list[float]:
 def versions() -> dict[str, str | None]:
     """What made the report; `commit` is None outside a git checkout of uavrl."""
     return {
-        "uavrl": uavrl.__version__,
+        "uavrl": __version__,
         "python": platform.python_version(),
         "numpy": np.__version__,
         "torch": metadata.version("torch"),
@@ -275,7 +275,7 @@ def versions() -> dict[str, str | None]:
 
 
 def _commit() -> str | None:
-    package = Path(uavrl.__file__).resolve().parent
+    package = Path(__file__).resolve().parents[1]
     git = ["git", "-C", str(package)]
     try:
         top = subprocess.run([*git, "rev-parse", "--show-toplevel", "HEAD"], capture_output=True, text=True, check=True)
