@@ -353,12 +353,14 @@ def test_gradient_through_the_whole_chain_is_the_finite_difference(sampler: Samp
 
 
 @given(st.floats(-(2.0**100), 2.0**100, width=32))
-def test_straight_through_clamp_is_exact_with_identity_gradient(value: float) -> None:
+def test_straight_through_clamp_is_exact_and_its_gradient_never_leads_further_out(value: float) -> None:
     x = torch.tensor([value], requires_grad=True)
     out = straight_through_clamp(x)
-    (gradient,) = torch.autograd.grad(3 * out, x)
     assert out.item() == min(max(value, -1.0), 1.0)
-    assert gradient.item() == 3
+    for slope in (3.0, -3.0):
+        (gradient,) = torch.autograd.grad(slope * out, x, retain_graph=True)
+        outwards = abs(value) > 1 and slope * value < 0  # descent goes against the slope
+        assert gradient.item() == (0.0 if outwards else slope)
     with torch.no_grad():
         assert straight_through_clamp(x).item() == out.item()
 

@@ -8,7 +8,7 @@ sum of x_i, x_0 and noise. Step 1 ends on the predicted x_0 in each of them. Not
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -41,12 +41,28 @@ def predict_x0(schedule: Schedule, x: Tensor, step: Tensor, predicted_noise: Ten
 
 
 def straight_through_clamp(x: Tensor) -> Tensor:
-    """Clamp x (any shape) to [-1, 1] exactly, with the identity as its gradient (Bengio et al. 2013).
+    """Clamp x (any shape) to [-1, 1] exactly, with the identity as its gradient (Bengio et al. 2013) but outwards.
 
-    The gradient of a plain clamp is zero outside the box, so guidance could never bring a sample back.
+    The gradient of a plain clamp is zero outside the box, so guidance could never bring a sample back. The identity
+    alone lets guidance push a sample out for ever, for what it is clamped to no longer changes: predicted noise grew
+    until it was worse than none. So a gradient passes unless it leads further out.
     """
-    clamped = x.clamp(-1, 1)
-    return clamped.detach() + (x - x.detach()) if torch.is_grad_enabled() else clamped
+    clamped: Tensor = _Clamp.apply(x) if torch.is_grad_enabled() else x.clamp(-1, 1)
+    return clamped
+
+
+class _Clamp(torch.autograd.Function):
+    """Clamp to [-1, 1] through which a loss pulls inwards from anywhere, and outwards only from within."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
+        return x.clamp(-1, 1)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        (x,) = ctx.saved_tensors
+        return gradient * ((x.abs() <= 1) | (gradient * x > 0))  # descent goes against the gradient
 
 
 def ddpm(
