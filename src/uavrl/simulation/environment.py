@@ -26,6 +26,8 @@ from uavrl.simulation.state import Draws, FlightAction, Outcome, SimState
 Float = NDArray[np.float64]
 Observation = Any  # (N, K+3) array, or a dict of arrays, as the observation space says
 
+ENVIRONMENT_ID = "uavrl/DataCollection-v0"  # registered in uavrl/__init__.py
+
 _LARGEST = float(np.finfo(np.float32).max)
 
 _Rows = TypeVar("_Rows", SimState, Outcome)

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from uavrl import ENVIRONMENT_ID
 from uavrl.agents.sac import Sac, SacConfig
 from uavrl.datasets.replay import ReplayLog
 from uavrl.datasets.transitions import Transitions, transition_columns
@@ -20,7 +19,7 @@ from uavrl.errors import CheckpointError, ConfigError, DivergenceError
 from uavrl.evaluation.rollouts import EVALUATION_SEED, fixed_layout
 from uavrl.networks import fit_normalisers
 from uavrl.scenario import Scenario
-from uavrl.simulation.environment import DataCollectionVectorEnv
+from uavrl.simulation.environment import ENVIRONMENT_ID, DataCollectionVectorEnv
 from uavrl.simulation.state import FlightAction, Outcome, SimState
 from uavrl.training.batches import OBSERVATION_OF, spaces_of, to_batch, to_tensors, transformed
 from uavrl.training.checkpoint import (
