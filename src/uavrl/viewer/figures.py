@@ -55,6 +55,7 @@ def training_curves(logs: Mapping[str, Path], out: Path) -> None:
     keys = [key for key in ("return", "q") if key in found] + sorted(key for key in found if key.endswith("_loss"))
     if not keys:
         raise ConfigError(f"log '{next(iter(logs.values()))}' holds no 'return', 'q' or '..._loss' to draw")
+    last = max(row["step"] for rows in runs.values() for row in rows)
     columns = min(2, len(keys))
     lines = -(-len(keys) // columns)
     figure = Figure(figsize=(5.2 * columns, 2.8 * lines + 0.5), dpi=_DPI, layout="constrained")
@@ -69,7 +70,7 @@ def training_curves(logs: Mapping[str, Path], out: Path) -> None:
         axes.set_xlabel("step")
         axes.grid(color="#ececec", linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
-        axes.margins(x=0.02)
+        axes.set_xlim(0, 1.02 * last)
         every = np.concatenate(values)
         if key.endswith("_loss") and every.size and every.min() > 0 and every.max() > 30 * every.min():
             axes.set_yscale("log")
