@@ -1,0 +1,251 @@
+"""What every agent owes, whatever it learns: update, act, save, resume."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from tests.agents.problems import (
+    DEVICES,
+    KINDS,
+    NAMES,
+    Kind,
+    agent,
+    batch,
+    copies,
+    diffusion_sac,
+    disturb,
+    equal,
+    observation,
+    spaces,
+)
+from uavrl.agents.base import Agent
+from uavrl.agents.registry import PRESETS, make_agent, preset
+from uavrl.errors import CheckpointError, ConfigError
+from uavrl.networks import Observation
+from uavrl.training.checkpoint import agent_tensors, load_checkpoint, restore_agent, save_checkpoint
+
+EVERY = [(name, kind) for name in NAMES for kind in KINDS]
+ALL = pytest.mark.parametrize(("name", "kind"), EVERY)
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def teach(made: Agent, kind: Kind, first: int, count: int, noise: torch.Generator) -> list[dict[str, float]]:
+    """`count` updates on the batches numbered from `first`."""
+    return [
+        {name: float(value) for name, value in made.update(batch(kind, 8, seed), noise).items()}
+        for seed in range(first, first + count)
+    ]
+
+
+def rows_of(seen: Observation, rows: slice) -> Observation:
+    return {key: value[rows] for key, value in seen.items()} if isinstance(seen, dict) else seen[rows]
+
+
+@ALL
+def test_update_reports_finite_numbers_and_moves_what_it_trains(name: str, kind: Kind) -> None:
+    made = agent(name, kind)
+    before = {key: copies(network) for key, network in made.networks.items()}
+    for metrics in teach(made, kind, 0, 2, generator()):
+        assert metrics
+        assert all(value == value and abs(value) < 1e6 for value in metrics.values()), metrics
+        assert metrics["actor_gradient"] > 0
+    for key, network in made.networks.items():
+        assert not equal(before[key], copies(network)), key
+
+
+@ALL
+def test_actions_are_legal_and_come_from_the_generator_alone(name: str, kind: Kind) -> None:
+    made, seen = agent(name, kind), observation(kind, 64)
+    torch.manual_seed(0)
+    first = made.act(seen, generator=generator(1))
+    torch.manual_seed(1)
+    again, other = made.act(seen, generator=generator(1)), made.act(seen, generator=generator(2))
+    assert first.continuous.shape == (64, 2)
+    assert first.continuous.abs().max() <= 1.0
+    assert first.choice.shape == (64,)
+    assert first.choice.dtype == torch.int64
+    assert set(first.choice.tolist()) == set(range(DEVICES + 1))  # untrained: every choice occurs
+    assert torch.equal(first.continuous, again.continuous)
+    assert torch.equal(first.choice, again.choice)
+    assert not torch.equal(first.continuous, other.continuous)
+    assert not torch.equal(first.choice, other.choice)
+    assert not first.continuous.requires_grad
+
+
+@ALL
+def test_deterministic_actions_depend_on_their_own_row_alone(name: str, kind: Kind) -> None:
+    made, seen = agent(name, kind), observation(kind, 12)
+    whole = made.act(seen, generator=generator(1), deterministic=True)
+    again = made.act(seen, generator=generator(2), deterministic=True)
+    assert torch.equal(whole.continuous, again.continuous)
+    assert torch.equal(whole.choice, again.choice)
+    for rows in (slice(0, 1), slice(5, 9)):
+        part = made.act(rows_of(seen, rows), generator=generator(3), deterministic=True)
+        torch.testing.assert_close(part.continuous, whole.continuous[rows], rtol=1e-4, atol=1e-5)
+        assert torch.equal(part.choice, whole.choice[rows])
+    assert whole.continuous.std() > 1e-3  # and not on nothing
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_set_network_acts_for_another_number_of_devices(name: str) -> None:
+    made = agent(name, "devices")
+    action = made.act(observation("devices", 50, devices=9), generator=generator())
+    assert set(action.choice.tolist()) - set(range(DEVICES + 1))
+    assert action.choice.max() <= 9
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_padded_device_is_never_chosen(name: str, deterministic: bool) -> None:
+    made, seen = agent(name, "devices"), observation("devices", 200)
+    assert isinstance(seen, dict)
+    seen["devices"][:, 1, 5] = 0.0
+    for candidates in (1, 3) if name == "diffusion_sac" else (1,):
+        if name == "diffusion_sac":
+            made = agent(name, "devices", candidates=candidates)
+        action = made.act(seen, generator=generator(), deterministic=deterministic)
+        assert 2 not in action.choice.tolist()
+
+
+@ALL
+def test_a_saved_agent_acts_and_learns_as_before(name: str, kind: Kind, tmp_path: Path) -> None:
+    """2 N updates equal N, a checkpoint, and N more, bit for bit."""
+    straight, noise = agent(name, kind), generator(3)
+    teach(straight, kind, 0, 6, noise)
+    made, noise = agent(name, kind), generator(3)
+    teach(made, kind, 0, 3, noise)
+    save_checkpoint(tmp_path / "c", {}, agent_tensors(made) | {"loop": {"generator": noise.get_state()}})
+    seen = observation(kind, 10)
+    expected = made.act(seen, generator=generator(4))
+
+    tensors = load_checkpoint(tmp_path / "c").tensors
+    loaded, noise = agent(name, kind, seed=99), generator(99)
+    assert not equal(copies(loaded.networks), copies(made.networks))
+    restore_agent(loaded, tensors)
+    noise.set_state(tensors["loop"]["generator"])
+    assert equal(copies(loaded.networks), copies(made.networks))
+    found = loaded.act(seen, generator=generator(4))
+    assert torch.equal(found.continuous, expected.continuous)
+    assert torch.equal(found.choice, expected.choice)
+    teach(loaded, kind, 3, 3, noise)
+    assert equal(copies(loaded.networks), copies(straight.networks))
+    for key, tensor in agent_tensors(straight)["optimisers"].items():
+        assert torch.equal(tensor, agent_tensors(loaded)["optimisers"][key]), key
+
+
+RESUME = """
+import sys
+from pathlib import Path
+import torch
+from tests.agents.problems import agent
+from tests.agents.test_conformance import generator, teach
+from uavrl.training.checkpoint import agent_tensors, load_checkpoint, restore_agent, save_checkpoint
+torch.set_num_threads(int(sys.argv[3]))
+tensors = load_checkpoint(Path(sys.argv[1])).tensors
+made, noise = agent("diffusion_sac", "devices", seed=5), generator(5)
+restore_agent(made, tensors)
+noise.set_state(tensors["loop"]["generator"])
+teach(made, "devices", 3, 3, noise)
+save_checkpoint(Path(sys.argv[2]), {}, agent_tensors(made))
+"""
+
+
+def test_a_new_process_goes_on_bit_for_bit(tmp_path: Path) -> None:
+    straight, noise = agent("diffusion_sac", "devices"), generator(3)
+    teach(straight, "devices", 0, 3, noise)
+    save_checkpoint(tmp_path / "a", {}, agent_tensors(straight) | {"loop": {"generator": noise.get_state()}})
+    teach(straight, "devices", 3, 3, noise)
+    command = [sys.executable, "-c", RESUME, str(tmp_path / "a"), str(tmp_path / "b"), str(torch.get_num_threads())]
+    subprocess.run(command, check=True, cwd=Path(__file__).parents[2])
+    assert equal(load_checkpoint(tmp_path / "b").tensors["networks"], copies(straight.networks))
+
+
+@ALL
+def test_weights_of_another_shape_are_refused_in_one_line(name: str, kind: Kind) -> None:
+    wide = agent(name, kind, network={"width": 16})
+    with pytest.raises(CheckpointError, match="does not fit") as error:
+        restore_agent(agent(name, kind), agent_tensors(wide))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_of_several_candidates_the_best_by_the_smaller_q_is_taken(kind: Kind) -> None:
+    made = diffusion_sac(kind, candidates=5)
+    disturb(made.critic, 1)
+    seen = observation(kind, 30)
+
+    def worth(count: int) -> torch.Tensor:
+        made.config = made.config.model_copy(update={"candidates": count})
+        action = made.act(seen, generator=generator(1))
+        with torch.no_grad():
+            table = made.critic.all_choices(made.critic.encode(seen), action.continuous).amin(dim=0)
+        return table.gather(1, action.choice[:, None]).squeeze(1)
+
+    few, many = worth(1), worth(64)
+    assert (many > few).float().mean() > 0.8
+    with (
+        torch.no_grad()
+    ):  # with many candidates, no worse than the best choice at a fixed displacement, but for few rows
+        best = made.critic.all_choices(made.critic.encode(seen), torch.zeros(30, 2)).amin(dim=0).amax(dim=1)
+    assert (many > best - 0.1).float().mean() > 0.8
+
+
+def test_the_average_acts_not_the_network_in_training() -> None:
+    for name in ("bc", "diffusion_sac"):
+        made, seen = agent(name, "mlp"), observation("mlp", 20)
+        before = made.act(seen, generator=generator(1))
+        disturb(made.actor.denoiser, 1)  # type: ignore[attr-defined]  # of both agents
+        assert torch.equal(made.act(seen, generator=generator(1)).continuous, before.continuous)
+        disturb(made.actor.average, 1)  # type: ignore[attr-defined]  # as above
+        assert not torch.equal(made.act(seen, generator=generator(1)).continuous, before.continuous)
+
+
+@pytest.mark.parametrize(("name", "which"), [(name, which) for name in PRESETS for which in PRESETS[name]])
+def test_presets_make_agents_that_learn(name: str, which: str) -> None:
+    config = preset(name, which)
+    assert config.name == name
+    small: dict[str, Any] = {"network": config.network.model_copy(update={"width": 8})}
+    kind = config.network.kind
+    made = make_agent(spaces(kind), config.model_copy(update=small))
+    assert teach(made, kind, 0, 1, generator())
+
+
+def test_the_papers_preset_is_the_papers() -> None:
+    config = preset("diffusion_sac", "paper")
+    assert config.name == "diffusion_sac"
+    assert (config.network.kind, config.network.width, config.network.depth) == ("mlp", 256, 3)
+    assert (config.batch_size, config.discount, config.diffusion.steps) == (64, 0.99, 50)
+    assert (config.bc_weight, config.cql_weight, config.gradient) == (0.5, 0.0, "full_chain")
+    assert (config.diffusion.schedule, config.diffusion.variance, config.diffusion.clip_x0) == ("linear", "beta", False)
+    assert (config.reward.transform, config.reward.clip, config.candidates) == ("zscore", None, 1)
+
+
+@pytest.mark.parametrize(("name", "which"), [("sca", "default"), ("bc", "papers")])
+def test_an_unknown_preset_is_refused(name: str, which: str) -> None:
+    with pytest.raises(ConfigError, match="allowed: "):
+        preset(name, which)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"gradient": "last_k", "gradient_steps": 6},
+        {"guidance": "softmax"},
+        {"bc_weight": 1.1},
+        {"cql_weight": -0.1},
+        {"choice_temperature": 0.0},
+        {"surprise": 1},
+    ],
+)
+def test_settings_that_contradict_each_other_are_refused(changes: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=next(iter(changes)) if "gradient" not in changes else "gradient_steps"):
+        agent("diffusion_sac", "devices", **changes)

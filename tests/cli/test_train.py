@@ -1,0 +1,157 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.datasets.flights import fly, small_scenario
+from uavrl.cli import main
+from uavrl.cli.train import TRIAL_SEED, trial_flights
+from uavrl.datasets import save_flat
+from uavrl.evaluation.rollouts import EVALUATION_SEED, fixed_layout
+from uavrl.training.checkpoint import load_checkpoint
+from uavrl.training.policy import load_policy
+
+SMALL = [word for setting in ("network.width=8", "batch_size=8", "diffusion.steps=2") for word in ("--set", setting)]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty current directory with a log of 60 rows in log.parquet."""
+    monkeypatch.chdir(tmp_path)
+    scenario = small_scenario()
+    save_flat(tmp_path / "log.parquet", fly(scenario, steps=20), scenario)
+    return tmp_path
+
+
+def train(*words: str) -> int:
+    return main(["train", *words])
+
+
+@pytest.mark.parametrize("agent", ["diffusion_sac", "bc"])
+def test_a_flat_file_becomes_a_policy(folder: Path, agent: str, capsys: pytest.CaptureFixture[str]) -> None:
+    words = [agent, "--out", "runs/mine", "--data", "log.parquet", "--updates", "4", "--seed", "5", *SMALL]
+    assert train(*words) == 0
+    captured = capsys.readouterr()
+    assert "4 updates on 60 transitions; policy in runs/mine" in captured.out
+    assert "uavrl evaluate --policy tdm --policy runs/mine --scenario released" in captured.out
+    assert len(captured.err.splitlines()) <= 1
+    document = load_checkpoint(folder / "runs/mine/checkpoint").document
+    assert (document["agent"], document["step"], document["data"]["rows"]) == (agent, 4, 60)
+    assert document["train"]["seed"] == 5
+    assert document["config"]["network"]["width"] == 8
+    policy = load_policy(folder / "runs/mine", small_scenario())
+    assert (policy.name, policy.needs) == (agent, "devices")
+    assert [json.loads(line)["step"] for line in (folder / "runs/mine/metrics.jsonl").read_text().splitlines()] == [4]
+
+
+def test_a_run_is_not_overwritten_and_goes_on_only_with_its_own_settings(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["bc", "--out", "run", "--data", "log.parquet", "--updates", "2", *SMALL]
+    assert train(*words) == 0
+    assert train(*words) == 2
+    assert "holds a run already; give --resume" in capsys.readouterr().err
+    assert train(*words, "--resume") == 0
+    assert "going on from update 2" in capsys.readouterr().err
+    assert train(*words, "--resume", "--set", "learning_rate=0.1") == 2
+    assert "was started with other settings" in capsys.readouterr().err
+    assert train(*words, "--resume", "--size", "50") == 2
+    assert "other data" in capsys.readouterr().err
+
+
+def test_a_part_of_a_file_and_the_papers_settings(folder: Path) -> None:
+    words = ["diffusion_sac", "--out", "run", "--data", "log.parquet", "--size", "30", "--preset", "paper"]
+    assert train(*words, "--updates", "1", *SMALL) == 0
+    document = load_checkpoint(folder / "run/checkpoint").document
+    assert document["data"]["rows"] == 30
+    assert document["spaces"]["observation"] == 6
+    assert document["config"]["network"]["kind"] == "mlp"
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        (["sca", "--out", "o"], ["sca", "diffusion_sac"]),
+        (["bc"], ["--out"]),
+        (["bc", "--out", "o", "--data", "gone.parquet"], ["gone.parquet", "no such file"]),
+        (["bc", "--out", "o", "--data", "cut.parquet"], ["cut.parquet"]),
+        (["bc", "--out", "o", "--scenario", "mars"], ["'mars'", "released"]),
+        (["bc", "--out", "o", "--scenario", "released"], ["10"]),
+        (["bc", "--out", "o", "--updates", "0"], ["updates", "0", "greater than or equal to 1"]),
+        (["bc", "--out", "o", "--updates", "many"], ["--updates", "many"]),
+        (["bc", "--out", "o", "--seed", "1000000"], ["seed", "1000000", "less than 1000000"]),
+        (["bc", "--out", "o", "--seed", "-1"], ["seed", "-1"]),
+        (["bc", "--out", "o", "--size", "61"], ["size = 61", "1 to 60"]),
+        (["bc", "--out", "o", "--size", "9", "--data-seed", "-1"], ["seed = -1"]),
+        (["bc", "--out", "o", "--quality", "good"], ["--quality good needs --size"]),
+        (["bc", "--out", "o", "--set", "bc_weight=0.3"], ["'bc_weight' does not exist", "learning_rate"]),
+        (["diffusion_sac", "--out", "o", "--set", "bc_weight=3"], ["bc_weight", "3", "less than or equal to 1"]),
+        (["diffusion_sac", "--out", "o", "--set", "bc_weight"], ["'bc_weight'", "name=value"]),
+        (["diffusion_sac", "--out", "o", "--set", "diffusion.step=3"], ["'diffusion.step' does not exist", "steps"]),
+        (["diffusion_sac", "--out", "o", "--set", "diffusion=3"], ["diffusion"]),
+        (["diffusion_sac", "--out", "o", "--set", "name=bc"], ["'name' does not exist"]),
+        (["diffusion_sac", "--out", "o", "--set", "guidance=softmax"], ["guidance = 'softmax'", "choice_heads"]),
+        (["diffusion_sac", "--out", "o", "--set", "gradient=half"], ["gradient", "'half'", "full_chain"]),
+        (["bc", "--out", "o", "--resume"], ["--resume", "holds no checkpoint"]),
+        (["bc", "--out", "log.parquet"], ["--out", "log.parquet", "directory"]),
+        (["bc", "--out", "log.parquet/run"], ["--out", "log.parquet/run", "directory"]),
+    ],
+)
+def test_wrong_input_is_one_line_and_code_2(
+    folder: Path, words: list[str], parts: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "cut.parquet").write_bytes((folder / "log.parquet").read_bytes()[:-40])
+    given = words if "--data" in words else [*words, "--data", "log.parquet"]
+    assert train(*given) == 2
+    captured = capsys.readouterr()
+    (line,) = captured.err.splitlines()
+    assert line.startswith("uavrl: error: ")
+    assert all(part in line for part in parts), line
+    assert captured.out == ""
+    assert not (folder / "o" / "checkpoint").exists()
+
+
+def test_a_damaged_checkpoint_is_one_line_and_code_2(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["bc", "--out", "run", "--data", "log.parquet", "--updates", "1", *SMALL]
+    assert train(*words) == 0
+    capsys.readouterr()
+    file = folder / "run/checkpoint/networks.safetensors"
+    file.write_bytes(file.read_bytes()[:-1])
+    assert train(*words, "--resume") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "networks.safetensors' is damaged" in line
+
+
+def test_trial_flights_are_of_their_own_seed_and_of_the_datas_layout_where_it_is_one(folder: Path) -> None:
+    assert TRIAL_SEED < EVALUATION_SEED
+    words = ["bc", "--out", "run", "--data", "log.parquet", "--updates", "2", "--evaluate-every", "1", *SMALL]
+    assert train(*words) == 0
+    rows = [json.loads(line) for line in (folder / "run/metrics.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows if "return" in row] == [1, 2]
+    assert all(row["return"] < 0 for row in rows if "return" in row)
+
+    scenario = small_scenario()
+    seen: list[np.ndarray] = []
+
+    class Spy:
+        name, needs = "spy", "devices"
+
+        def reset(self, count: int) -> None: ...
+
+        def act(self, observation: dict[str, np.ndarray], **_: object) -> object:
+            from uavrl.simulation.state import FlightAction
+
+            seen.append(observation["uav"][:, None, :2] + observation["devices"][:, :, :2])
+            count = len(observation["uav"])
+            return FlightAction(np.zeros((count, 2)), np.zeros(count, dtype=np.int64))
+
+    one = fly(scenario, steps=5, layout=fixed_layout(scenario))
+    result = trial_flights(one, scenario, episodes=3)(Spy())  # type: ignore[arg-type]  # flies as an AgentPolicy does
+    assert set(result) == {"return", "return_median"}
+    np.testing.assert_allclose(seen[-1], np.broadcast_to(fixed_layout(scenario), (3, 3, 2)), atol=1e-2)
+    seen.clear()
+    trial_flights(fly(scenario, steps=30), scenario, episodes=3)(Spy())  # type: ignore[arg-type]  # as above
+    assert len(np.unique(seen[-1].round(1), axis=0)) == 3

@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from tests.datasets.flights import fly, small_scenario
+from uavrl.agents.base import RewardConfig
+from uavrl.scenario import load_scenario
+from uavrl.simulation.environment import observe
+from uavrl.simulation.observations import ObservationKind
+from uavrl.simulation.state import SimState
+from uavrl.training.batches import reward_transform, spaces_of, to_batch, transformed
+
+
+@pytest.mark.parametrize("kind", ["paper", "devices"])
+def test_a_batch_holds_what_a_policy_saw_and_commanded(kind: ObservationKind) -> None:
+    scenario = small_scenario()
+    log = fly(scenario, steps=20)
+    data = to_batch(log, kind, scenario)
+    for row in (0, 7, len(log) - 1):
+        one = log.take(np.array([row]))
+        zero = np.zeros(1)
+        before = SimState(one.position_m, one.age_s, one.energy_j, one.used_j, zero, one.step)
+        after = SimState(one.next_position_m, one.next_age_s, one.next_energy_j, one.next_used_j, zero, one.step)
+        for state, found in ((before, data.observation), (after, data.next_observation)):
+            expected = observe(kind, scenario, one.layout_m.astype(np.float64), state)
+            if kind == "paper":
+                assert isinstance(found, torch.Tensor)
+                np.testing.assert_allclose(found[row], expected[0], rtol=1e-6)
+            else:
+                assert isinstance(found, dict)
+                for name, value in expected.items():
+                    np.testing.assert_allclose(found[name][row], value[0], rtol=1e-5, atol=1e-3)
+    reach = scenario.airframe.max_displacement_m
+    np.testing.assert_allclose(data.action.continuous.numpy() * reach, log.displacement_m, rtol=1e-5, atol=1e-4)
+    assert not np.allclose(log.displacement_m, log.executed_displacement_m)  # commands of the box, moves of the disc
+    assert data.action.choice.tolist() == log.device.tolist()
+    assert data.reward.tolist() == log.reward.tolist()
+    assert data.duration_s.tolist() == log.duration_s.tolist()
+
+
+def test_a_truncated_flight_goes_on_in_the_batch_and_a_drained_battery_ends_it() -> None:
+    scenario = small_scenario(max_steps=30, energy_budget_j=10.0)
+    log = fly(scenario, steps=90)
+    assert log.truncated.any() or log.terminated.any()
+    assert log.terminated.any()
+    data = to_batch(log, "devices", scenario)
+    assert data.terminated.tolist() == log.terminated.astype(float).tolist()
+    endless = small_scenario()
+    log = fly(endless, steps=30)
+    assert log.truncated.any()
+    assert not to_batch(log, "paper", endless).terminated.any()
+
+
+def test_spaces_are_those_of_the_scenario() -> None:
+    scenario = load_scenario("released", devices=6)
+    assert (spaces_of(scenario, "mlp").observation, spaces_of(scenario, "devices").observation) == (9, None)
+    assert (spaces_of(scenario, "mlp").continuous, spaces_of(scenario, "mlp").choices) == (2, 7)
+
+
+REWARD = np.array([-10.0, -1.0, -2.0, -3.0, -4.0])
+
+
+@pytest.mark.parametrize(
+    ("config", "terminates", "expected"),
+    [
+        (RewardConfig(transform="none", clip=None), False, REWARD),
+        (RewardConfig(transform="none", clip=5.0, scale=2.0), False, [-5.0, -2.0, -4.0, -5.0, -5.0]),
+        (RewardConfig(transform="centred", clip=None), False, REWARD + 3.0),
+        (RewardConfig(transform="centred", clip=4.0, scale=3.0), False, [-4.0, 4.0, 3.0, 0.0, -3.0]),
+        (RewardConfig(transform="centred", clip=None), True, REWARD),  # a shift would pay for ending, or for not ending
+        (RewardConfig(transform="zscore", clip=None), False, (REWARD - REWARD.mean()) / REWARD.std()),
+    ],
+)
+def test_rewards_are_transformed_as_the_setting_says(config: RewardConfig, terminates: bool, expected: object) -> None:
+    shift, factor = reward_transform(REWARD, config, terminates)
+    found = transformed(torch.from_numpy(REWARD), shift, factor, config)
+    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-5)
+
+
+def test_equal_rewards_do_not_divide_by_zero() -> None:
+    config = RewardConfig(transform="zscore", clip=None)
+    shift, factor = reward_transform(np.full(5, -2.0), config, False)
+    assert transformed(torch.full((5,), -2.0), shift, factor, config).abs().max() < 1e-3

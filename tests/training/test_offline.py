@@ -1,0 +1,233 @@
+from __future__ import annotations
+
+import json
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tests.agents.problems import copies, equal, network
+from tests.datasets.flights import fly, small_scenario
+from uavrl.agents.bc import BcConfig
+from uavrl.agents.diffusion_actor import DiffusionConfig
+from uavrl.agents.diffusion_sac import DiffusionSacConfig
+from uavrl.datasets import Transitions
+from uavrl.errors import CheckpointError, ConfigError, DivergenceError
+from uavrl.training.checkpoint import agent_tensors, load_checkpoint
+from uavrl.training.offline import OfflineLearner, TrainConfig, take
+from uavrl.training.policy import AgentPolicy, load_policy
+
+SCENARIO = small_scenario()
+CHAIN = DiffusionConfig(steps=2)
+
+
+def config(name: str = "diffusion_sac", kind: str = "devices", **changes: Any) -> TrainConfig:
+    shape = network("mlp" if kind == "mlp" else "devices", width=8)
+    common: dict[str, Any] = {"network": shape, "diffusion": CHAIN, "batch_size": 8} | changes.pop("agent", {})
+    agent = BcConfig(**common) if name == "bc" else DiffusionSacConfig(**common)
+    settings = {"updates": 12, "log_every": 2, "save_every": 5, "seed": 3, **changes}
+    return TrainConfig(scenario=SCENARIO, agent=agent, **settings)
+
+
+@pytest.fixture(scope="module")
+def flown() -> Transitions:
+    return fly(SCENARIO, steps=20)
+
+
+def quiet(done: int, text: str) -> None:
+    """A reporter that says nothing."""
+
+
+def rows(directory: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (directory / "metrics.jsonl").read_text().splitlines()]
+
+
+def interrupt_at(step: int) -> Any:
+    def report(done: int, text: str) -> None:
+        if done == step:
+            signal.raise_signal(signal.SIGINT)
+
+    return report
+
+
+@pytest.mark.parametrize(("name", "kind"), [("diffusion_sac", "devices"), ("diffusion_sac", "mlp"), ("bc", "devices")])
+def test_an_interrupted_run_ends_as_one_that_was_not(tmp_path: Path, flown: Transitions, name: str, kind: str) -> None:
+    straight = OfflineLearner(config(name, kind), flown)
+    straight.run(tmp_path / "straight", quiet)
+    broken = OfflineLearner(config(name, kind), flown)
+    with pytest.raises(KeyboardInterrupt):
+        broken.run(tmp_path / "broken", interrupt_at(6))
+    assert load_checkpoint(tmp_path / "broken" / "checkpoint").document["step"] == 7  # the step after was finished
+    resumed = OfflineLearner.resume(tmp_path / "broken", flown)
+    assert resumed is not None
+    assert resumed.config == config(name, kind)
+    resumed.run(tmp_path / "broken", quiet)
+    assert equal(copies(resumed.agent.networks), copies(straight.agent.networks))
+    assert equal(agent_tensors(resumed.agent)["optimisers"], agent_tensors(straight.agent)["optimisers"])
+    assert rows(tmp_path / "broken") == rows(tmp_path / "straight")
+    ended = [load_checkpoint(tmp_path / run / "checkpoint") for run in ("straight", "broken")]
+    assert ended[0].document == ended[1].document
+    assert all(equal(ended[0].tensors[name], ended[1].tensors[name]) for name in ended[0].tensors)
+
+
+def test_a_killed_run_goes_on_from_its_last_checkpoint_and_ends_the_same(tmp_path: Path, flown: Transitions) -> None:
+    straight = OfflineLearner(config(), flown)
+    straight.run(tmp_path / "straight", quiet)
+
+    def kill(done: int, text: str) -> None:
+        if done == 8:
+            raise RuntimeError("killed")
+
+    with pytest.raises(RuntimeError, match="killed"):
+        OfflineLearner(config(), flown).run(tmp_path / "killed", kill)
+    assert rows(tmp_path / "killed")[-1]["step"] == 8
+    resumed = OfflineLearner.resume(tmp_path / "killed", flown)
+    assert resumed is not None
+    assert resumed.updates == 5
+    resumed.run(tmp_path / "killed", quiet)
+    assert equal(copies(resumed.agent.networks), copies(straight.agent.networks))
+    assert rows(tmp_path / "killed") == rows(tmp_path / "straight")
+
+
+def test_one_seed_one_result_and_no_global_generator(tmp_path: Path, flown: Transitions) -> None:
+    before = torch.random.get_rng_state()
+    found = []
+    for seed in (3, 3, 4):
+        learner = OfflineLearner(config(seed=seed, updates=2), flown)
+        learner.run(tmp_path / str(len(found)), quiet)
+        found.append(copies(learner.agent.networks))
+    assert equal(found[0], found[1])
+    assert not equal(found[0], found[2])
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
+def test_the_learning_rate_falls_on_a_cosine_and_the_log_has_every_row(tmp_path: Path, flown: Transitions) -> None:
+    learner = OfflineLearner(config(), flown)
+    rates = []
+
+    def report(done: int, text: str) -> None:
+        rates.append(learner.agent.optimisers["critic"].param_groups[0]["lr"])
+
+    learner.run(tmp_path, report)
+    expected = 3e-4 * 0.5 * (1 + np.cos(np.pi * np.arange(12) / 12))
+    np.testing.assert_allclose(rates, expected, rtol=1e-6)
+    assert [row["step"] for row in rows(tmp_path)] == [2, 4, 6, 8, 10, 12]
+    assert {"q", "bc_loss", "guided_q", "critic_gradient", "actor_gradient"} <= set(rows(tmp_path)[0])
+
+
+def test_what_an_update_sees_is_a_row_of_the_data_as_a_whole(flown: Transitions) -> None:
+    learner = OfflineLearner(config(agent={"reward": {"transform": "centred", "clip": 1.5, "scale": 2.0}}), flown)
+    data, index = learner.data, torch.tensor([5, 0, 5])
+    reward = np.clip(2.0 * (flown.reward - np.median(flown.reward)), -1.5, 1.5)
+    np.testing.assert_allclose(data.reward.numpy(), reward, rtol=1e-4, atol=1e-5)
+    found = take(data, index)
+    assert isinstance(found.observation, dict)
+    assert isinstance(data.observation, dict)
+    assert isinstance(found.next_observation, dict)
+    assert isinstance(data.next_observation, dict)
+    for position, row in enumerate(index.tolist()):
+        assert torch.equal(found.observation["devices"][position], data.observation["devices"][row])
+        assert torch.equal(found.next_observation["uav"][position], data.next_observation["uav"][row])
+        assert torch.equal(found.action.continuous[position], data.action.continuous[row])
+        for name in ("reward", "duration_s", "terminated"):
+            assert getattr(found, name)[position] == getattr(data, name)[row]
+        assert found.action.choice[position] == data.action.choice[row]
+
+
+def test_the_data_of_a_perceptron_set_its_normalisers(flown: Transitions) -> None:
+    learner = OfflineLearner(config(kind="mlp"), flown)
+    state = learner.agent.networks.state_dict()
+    means = [value for name, value in state.items() if name.endswith("normaliser.mean")]
+    assert len(means) == 4  # denoiser, its average, critic, target
+    for mean in means:
+        np.testing.assert_allclose(mean[:2].numpy(), flown.position_m.mean(axis=0), rtol=1e-3)
+
+
+@pytest.mark.parametrize("sick", ["nan", "far"])
+def test_divergence_stops_the_run_and_the_last_good_checkpoint_stays(
+    tmp_path: Path, flown: Transitions, sick: str
+) -> None:
+    """Sick from update 6 on; the checkpoint of update 5 stays, though update 10 would save and no row was due at 10."""
+    learner = OfflineLearner(config(log_every=7, updates=30), flown)
+    real = learner.agent.update
+
+    def update(*arguments: Any) -> dict[str, torch.Tensor]:
+        metrics = real(*arguments)
+        if learner.updates < 5:
+            return metrics
+        if sick == "nan":
+            return metrics | {"critic_loss": torch.tensor(float("nan"))}
+        return metrics | {"q": torch.tensor(-2.0 * learner.q_limit)}
+
+    learner.agent.update = update  # type: ignore[method-assign]  # what a run that diverges does
+    with pytest.raises(
+        DivergenceError, match="diverged: " + ("critic_loss = nan" if sick == "nan" else "q = -")
+    ) as error:
+        learner.run(tmp_path, quiet)
+    assert "\n" not in str(error.value)
+    assert load_checkpoint(tmp_path / "checkpoint").document["step"] == 5
+    assert load_policy(tmp_path, SCENARIO).name == "diffusion_sac"
+
+
+def test_a_learning_rate_without_measure_is_found(tmp_path: Path, flown: Transitions) -> None:
+    learner = OfflineLearner(
+        config(updates=400, log_every=1, agent={"learning_rate": 1e6, "gradient_clip": None, "huber": None}), flown
+    )
+    with pytest.raises(DivergenceError, match="training diverged"):
+        learner.run(tmp_path, quiet)
+
+
+def test_data_of_another_number_of_devices_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"data have 2 devices, the scenario traffic.devices = 3"):
+        OfflineLearner(config(), fly(small_scenario(devices=2), steps=5))
+
+
+def test_a_device_that_is_not_there_is_refused(flown: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(ConfigError, match="device = 'cuda'"):
+        OfflineLearner(config(), flown, "cuda")
+
+
+def test_resume_refuses_what_it_cannot_go_on_with(tmp_path: Path, flown: Transitions) -> None:
+    assert OfflineLearner.resume(tmp_path, flown) is None
+    OfflineLearner(config(updates=1), flown).run(tmp_path, quiet)
+    with pytest.raises(CheckpointError, match="other data"):
+        OfflineLearner.resume(tmp_path, flown.take(np.arange(len(flown) - 1)))
+    manifest = tmp_path / "checkpoint" / "checkpoint.json"
+    document = json.loads(manifest.read_text())
+    for change, message in (
+        ({"kind": "online"}, "kind 'online'"),
+        ({"device": "cuda"}, "device = 'cuda'"),
+        ({"train": {**document["train"], "surprise": 1}}, "no run of this version"),
+        ({"train": None}, "no run of this version"),
+    ):
+        manifest.write_text(json.dumps(document | change))
+        with pytest.raises(CheckpointError, match=message) as error:
+            OfflineLearner.resume(tmp_path, flown)
+        assert "\n" not in str(error.value)
+
+
+def test_trial_flights_are_logged_and_do_not_disturb_training(tmp_path: Path, flown: Transitions) -> None:
+    asked: list[str] = []
+
+    def evaluate(policy: AgentPolicy) -> dict[str, float]:
+        asked.append(policy.name)
+        observation = {"uav": np.zeros((2, 4), np.float32), "devices": np.ones((2, 3, 6), np.float32)}
+        policy.act(observation, generator=np.random.default_rng(0))
+        return {"return": -1.5}
+
+    straight = OfflineLearner(config(), flown)
+    straight.run(tmp_path / "straight", quiet)
+    tried = OfflineLearner(config(evaluate_every=6), flown)
+    tried.run(tmp_path / "tried", quiet, evaluate)
+    assert asked == ["diffusion_sac"] * 2
+    assert [row["step"] for row in rows(tmp_path / "tried") if "return" in row] == [6, 12]
+    assert equal(copies(tried.agent.networks), copies(straight.agent.networks))
+
+
+def test_evaluation_seeds_are_refused() -> None:
+    with pytest.raises(ValueError, match="seed"):
+        config(seed=1_000_000)

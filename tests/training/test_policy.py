@@ -1,0 +1,87 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.agents.problems import KINDS, NAMES, Kind, agent, observation
+from uavrl.errors import CheckpointError
+from uavrl.scenario import Scenario, load_scenario
+from uavrl.training.checkpoint import agent_tensors, save_checkpoint
+from uavrl.training.policy import AgentPolicy, load_policy, trained_scenario
+
+SCENARIO = load_scenario("released", devices=4, max_steps=5)
+
+
+def saved(path: Path, name: str, kind: Kind, scenario: Scenario = SCENARIO) -> AgentPolicy:
+    made = agent(name, kind, devices=scenario.traffic.devices)
+    document = {
+        "agent": name,
+        "config": made.config.model_dump(mode="json"),
+        "spaces": made.spaces.model_dump(),
+        "scenario": scenario.model_dump(mode="json"),
+    }
+    save_checkpoint(path / "checkpoint", document, agent_tensors(made))
+    return AgentPolicy(name, made, scenario)
+
+
+def seen(kind: Kind, rows: int = 6, devices: int = 4) -> object:
+    found = observation(kind, rows, devices=devices)
+    return found.numpy() if isinstance(found, torch.Tensor) else {key: value.numpy() for key, value in found.items()}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", NAMES)
+def test_a_loaded_policy_flies_as_the_one_that_was_saved(tmp_path: Path, name: str, kind: Kind) -> None:
+    policy = saved(tmp_path, name, kind)
+    expected = policy.act(seen(kind), generator=np.random.default_rng(1))
+    assert expected.displacement_m.shape == (6, 2)
+    assert np.abs(expected.displacement_m).max() <= SCENARIO.airframe.max_displacement_m
+    assert np.abs(expected.displacement_m).max() > 1.0  # metres, not shares of the reach
+    for path in (tmp_path, tmp_path / "checkpoint"):
+        loaded = load_policy(path, SCENARIO)
+        assert (loaded.name, loaded.needs) == (name, "paper" if kind == "mlp" else "devices")
+        found = loaded.act(seen(kind), generator=np.random.default_rng(1))
+        assert (found.displacement_m == expected.displacement_m).all()
+        assert (found.device == expected.device).all()
+    other = load_policy(tmp_path, SCENARIO).act(seen(kind), generator=np.random.default_rng(2))
+    assert (other.displacement_m != expected.displacement_m).any()
+    assert trained_scenario(tmp_path) == SCENARIO
+
+
+def test_a_perceptron_for_another_number_of_devices_is_refused_and_a_set_network_is_not(tmp_path: Path) -> None:
+    larger = load_scenario("released", devices=7)
+    saved(tmp_path / "mlp", "bc", "mlp")
+    with pytest.raises(CheckpointError, match="perceptron for devices = 4, the scenario has 7"):
+        load_policy(tmp_path / "mlp", larger)
+    saved(tmp_path / "set", "bc", "devices")
+    action = load_policy(tmp_path / "set", larger).act(seen("devices", 99, 7), generator=np.random.default_rng(1))
+    assert action.device.max() > 4
+
+
+def test_candidates_are_set_at_loading_where_the_agent_has_them(tmp_path: Path) -> None:
+    saved(tmp_path, "diffusion_sac", "devices")
+    policy = load_policy(tmp_path, SCENARIO, candidates=4)
+    assert getattr(policy.agent.config, "candidates", None) == 4
+
+
+def test_a_checkpoint_of_something_else_is_refused_in_one_line(tmp_path: Path) -> None:
+    tensors = agent_tensors(agent("bc", "mlp"))
+    config = agent("bc", "mlp").config.model_dump(mode="json")
+    spaces = {"observation": 7, "continuous": 2, "choices": 5}
+    for number, document in enumerate(
+        (
+            {},
+            {"config": config},
+            {"config": {**config, "name": "td3"}, "spaces": spaces},
+            {"config": config, "spaces": 3},
+        )
+    ):
+        save_checkpoint(tmp_path / str(number), document, tensors)
+        with pytest.raises(CheckpointError, match="no agent of this version"):
+            load_policy(tmp_path / str(number), SCENARIO)
+    save_checkpoint(tmp_path / "wide", {"config": config, "spaces": {**spaces, "observation": 8}}, tensors)
+    with pytest.raises(CheckpointError):
+        load_policy(tmp_path / "wide", SCENARIO)
