@@ -48,7 +48,7 @@ def test_the_link_goes_to_the_device_just_served_and_tells_a_lost_packet() -> No
     assert (links[1]["x"], links[1]["y"]) == ([10.0, 100.0], [0.0, 200.0])
     assert (links[2]["x"], links[2]["y"]) == ([20.0, 900.0], [0.0, 800.0])
     assert (links[1]["line"]["color"], links[2]["line"]["color"]) == (INK, VERMILION)
-    assert links[2]["line"]["dash"] == "dot"
+    assert [link["line"]["dash"] for link in links] == ["dot", "solid", "dot", "dot"]  # each says it: frames only add
 
 
 def test_the_slider_and_the_button_reach_the_frames() -> None:
@@ -117,7 +117,7 @@ def test_the_page_carries_all_it_needs_and_says_how_it_thins() -> None:
 
     Sources().feed(page)
     assert Sources.found == []
-    assert f"return {episode.total_reward:.4g}" in head
+    assert f"return {episode.total_reward:,.0f}" in head
     assert "400 steps" in head
     assert "one step in 3 is shown" in head
     assert figure.count('"name":"') >= len(shown_steps(400))

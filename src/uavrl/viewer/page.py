@@ -132,18 +132,14 @@ class _Scene:
         device = int(episode.device[step - 1]) if step > 0 else 0
         link = np.concatenate([here, episode.layout_m[device - 1 : device].round(1)]) if device > 0 else here[:0]
         arrived = step > 0 and bool(episode.served[step - 1])
+        dash = "solid" if arrived else "dot"  # a frame must say both: what it leaves out stays as it was
         devices = np.arange(1, len(ages) + 1)
         colours = {"color": ages.tolist(), "coloraxis": "coloraxis"}
         outlines = np.where(devices == device, 3.0, 1.0).tolist()
         inks = np.where(ages > _DARK * self.oldest_s, "white", INK).tolist()
         return [
             (_MAP, _line(path, {"color": BLUE, "width": 2.2}, opacity=0.75)),
-            (
-                _MAP,
-                _line(
-                    link, {"color": INK, "width": 2.4} if arrived else {"color": VERMILION, "width": 2.4, "dash": "dot"}
-                ),
-            ),
+            (_MAP, _line(link, {"color": INK if arrived else VERMILION, "width": 2.4, "dash": dash})),
             (
                 _MAP,
                 _dots(
@@ -203,7 +199,8 @@ class _Scene:
         return (
             f"step {step} of {self.episode.steps}  |  {self.episode.time_s[step]:.1f} s  |  {serves}  |  "
             f"mean age {self.mean_age_s[step]:.2f} s, since the start {self.running_age_s[step]:.2f} s  |  "
-            f"{self.used_j[step] / self.joules[0]:.4g} {self.joules[1]}  |  return {self.total_reward[step]:.4g}"
+            f"{_number(self.used_j[step] / self.joules[0])} {self.joules[1]}  |  "
+            f"return {_number(self.total_reward[step])}"
         )
 
     def layout(self) -> dict[str, Any]:
@@ -221,7 +218,7 @@ class _Scene:
                 "cmin": 0.0,
                 "cmax": self.oldest_s,
                 "colorbar": {
-                    "title": {"text": "age (s)", "side": "right"},
+                    "title": {"text": "age (s)", "side": "right", "font": {"size": 13}},
                     "thickness": 14,
                     "x": 0.475,
                     "xanchor": "left",
@@ -301,11 +298,22 @@ class _Scene:
 
 
 def _nice(value: float) -> float:
-    """The next of 1, 1.5, 2, 3, 5, 7 x 10^n: a scale's end that is easy to read. 1 for zero."""
+    """The next of 1, 1.5, 2, 2.5, 3, 4, 5, 6, 8 x 10^n: a scale's end that is easy to read. 1 for zero."""
     if value <= 0:
         return 1.0
     power = 10.0 ** np.floor(np.log10(value))
-    return float(next(mark * power for mark in (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0) if mark * power >= value * 0.999))
+    return float(
+        next(
+            mark * power
+            for mark in (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+            if mark * power >= value * 0.999
+        )
+    )
+
+
+def _number(value: float) -> str:
+    """Four significant digits, or all of a larger whole, without an exponent."""
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
 _PAGE = """<!DOCTYPE html>
@@ -354,12 +362,12 @@ def episode_page(episode: Episode, frames: int = FRAMES) -> str:
     name, scenario = escape(episode.policy), escape(episode.scenario.name)
     return _PAGE.format(
         title=f"{name}: a flight in scenario {scenario}",
-        heading=f"{name}: return {episode.total_reward:.4g}",
+        heading=f"{name}: return {_number(episode.total_reward)}",
         summary=(
             f"One flight in scenario <b>{scenario}</b>, {len(episode.layout_m)} devices: "
             f"{episode.steps} steps in {episode.time_s[-1]:.1f} s, {each}. "
             f"{packets} packets sent, {lost} lost; mean age {running[-1]:.3g} s over time and {mean[1:].mean():.3g} s "
-            f"over steps; {episode.energy_j.sum():.4g} J used."
+            f"over steps; {_number(episode.energy_j.sum())} J used."
         ),
         legend=(
             f"Dots are devices, coloured by the age of their information (darkest: {oldest_s:g} s or more). "
