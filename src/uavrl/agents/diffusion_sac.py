@@ -53,6 +53,11 @@ class DiffusionSacConfig(AgentConfig):
     )
     displacement_weight: float = Field(3.0, gt=0, description="weight of a continuous entry in L_bc; 1 in the paper")
     actor_average: float = Field(0.995, ge=0, lt=1, description="decay of the target actor; 0: no average")
+    greedy_choice: bool = Field(
+        True,
+        description="d' of the backup and d of a decision: the critic's best for the actor's w; false: the actor's own "
+        "(paper). The critic knows every choice from one pass, and the data hold all of them",
+    )
     candidates: int = Field(1, ge=1, description="actions drawn at a decision; the one of largest min Q is taken")
 
     @model_validator(mode="after")
@@ -95,9 +100,7 @@ class DiffusionSac(Agent):
         with torch.no_grad():
             vector = self.actor.sample(self.actor.average, self.actor.average.encode(batch.next_observation), noise)
             following = decode(vector, self.spaces.continuous)
-            q_next = action_value(
-                self.target, self.target.encode(batch.next_observation), following, self.spaces.choices
-            ).amin(dim=0)
+            q_next = self._best(self.target, self.target.encode(batch.next_observation), following)[0]
             target = batch.reward + discounts(batch, self.config) * q_next
         context = self.critic.encode(batch.observation)
         q = action_value(self.critic, context, batch.action, self.spaces.choices)
@@ -193,15 +196,22 @@ class DiffusionSac(Agent):
     @torch.no_grad()
     def act(self, observation: Observation, *, generator: torch.Generator, deterministic: bool = False) -> HybridAction:
         """A sample of the target actor's chain, the best of `candidates` by min Q; deterministic: DDIM from zero."""
-        context, count = self.actor.average.encode(observation), self.config.candidates
-        if deterministic or count == 1:
+        context, config = self.actor.average.encode(observation), self.config
+        count = 1 if deterministic else config.candidates
+        if count == 1 and not config.greedy_choice:
             return self.actor.act(context, generator, deterministic)
-        drawn = self.actor.act(repeat(context, count), generator, deterministic=False)
-        choices = self.actor.average.vector_size(context) - self.spaces.continuous
-        q = action_value(self.critic, repeat(self.critic.encode(observation), count), drawn, choices).amin(dim=0)
-        rows = len(context[0])
+        drawn = self.actor.act(repeat(context, count), generator, deterministic)
+        q, choice = self._best(self.critic, repeat(self.critic.encode(observation), count), drawn)
+        rows = len(q) // count
         best = q.view(rows, count).argmax(dim=1) + count * torch.arange(rows, device=q.device)
-        return HybridAction(drawn.continuous[best], drawn.choice[best])
+        return HybridAction(drawn.continuous[best], choice[best])
+
+    def _best(self, critic: Critic, context: Context, action: HybridAction) -> tuple[Tensor, Tensor]:
+        """(min Q, choice), each (B,), of w with its own choice, or with the best one where the config says so."""
+        q = critic.all_choices(context, action.continuous).amin(dim=0)
+        if self.config.greedy_choice:
+            return q.max(dim=-1)
+        return q.gather(1, action.choice[:, None]).squeeze(1), action.choice
 
 
 def action_value(critic: Critic, context: Context, action: HybridAction, choices: int) -> Tensor:

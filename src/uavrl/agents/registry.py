@@ -35,6 +35,7 @@ PRESETS: dict[str, dict[str, BcConfig | DiffusionSacConfig]] = {
             cql_weight=0.0,
             q_scale="none",
             huber=None,
+            greedy_choice=False,
             displacement_weight=1.0,
         ),
     },

@@ -14,8 +14,8 @@ from torch.nn import functional
 from uavrl.networks.interfaces import Actor, ActorOutput, Context, Critic, Denoiser, Observation
 from uavrl.networks.mlp import bounded_log_std, step_embedding
 
-TOKEN_FEATURES = 8
-GLOBAL_FEATURES = 6
+TOKEN_FEATURES = 9
+GLOBAL_FEATURES = 7
 NEVER = -1e4  # logit and Q of a padded device
 
 
@@ -26,18 +26,20 @@ def _place(offset_m: Tensor, scale_m: float) -> Tensor:
 
 
 def features(observation: Observation, scale_m: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Tokens (B, K, 8), globals (B, 6), validity (B, K) and relative positions in metres (B, K, 2).
+    """Tokens (B, K, 9), globals (B, 7), validity (B, K) and relative positions in metres (B, K, 2).
 
-    Ages enter as log(1 + age) and as a share of the oldest: absolute for the value, relative for whom to serve.
+    Ages enter as log(1 + age), as they are, and as a share of the oldest: absolute for the value, relative for whom to
+    serve.
     """
     if not isinstance(observation, dict):
         raise TypeError('a set network takes observation = "devices"')
     uav, devices = observation["uav"], observation["devices"]
     offset, age, valid = devices[..., :2], devices[..., 2], devices[..., 5]
     log_age = torch.log1p(age) * valid
+    plain_age = age.clamp(max=20.0) / 5.0 * valid  # returns are sums of ages: linear where flights mostly are
     oldest = (age * valid).amax(dim=1, keepdim=True)
     share = age * valid / (oldest + 1e-3)
-    own = torch.stack([log_age, share, devices[..., 3], devices[..., 4] / 2.0, valid], dim=-1)
+    own = torch.stack([log_age, plain_age, share, devices[..., 3], devices[..., 4] / 2.0, valid], dim=-1)
     tokens = torch.cat([_place(offset, scale_m), own], dim=-1)
     count = valid.sum(dim=1, keepdim=True)
     globals_ = torch.cat(
@@ -47,6 +49,7 @@ def features(observation: Observation, scale_m: float) -> tuple[Tensor, Tensor, 
             uav[:, 3:4],
             torch.log1p(oldest),
             log_age.sum(dim=1, keepdim=True) / count,
+            plain_age.sum(dim=1, keepdim=True) / count,
         ],
         dim=-1,
     )
