@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,6 +34,6 @@ def test_totals_and_their_words() -> None:
 
 @pytest.mark.parametrize("name", [field.name for field in fields(Episode) if field.name not in ("policy", "scenario")])
 def test_an_array_of_another_flight_is_refused(name: str) -> None:
-    longer = np.concatenate([getattr(episode(), name)] * 2)
+    longer: dict[str, Any] = {name: np.concatenate([getattr(episode(), name)] * 2)}
     with pytest.raises(ValueError, match="needed"):
-        replace(episode(), **{name: longer})
+        replace(episode(), **longer)

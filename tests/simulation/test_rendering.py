@@ -74,11 +74,12 @@ def test_the_path_is_drawn_where_it_went_and_the_aircraft_at_its_end() -> None:
 
 def test_a_frame_leaves_nothing_behind_for_the_next() -> None:
     first = draw_frame(SCENARIO, LAYOUT, PATH, AGES, 2)
-    kept = first.copy()
+    kept, held = first.copy(), len(rendering._stage(SCENARIO)[1].get_children())
     other = draw_frame(SCENARIO, LAYOUT[::-1], PATH[::-1], AGES[::-1], 0)
     assert (first == kept).all()
     assert (other != first).any()
     assert (draw_frame(SCENARIO, LAYOUT, PATH, AGES, 2) == kept).all()
+    assert len(rendering._stage(SCENARIO)[1].get_children()) == held  # or every frame would cost memory
 
 
 @pytest.mark.parametrize(("devices", "width_m"), [(1, 1000.0), (30, 5000.0), (100, 300.0)])
