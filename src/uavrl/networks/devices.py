@@ -110,16 +110,18 @@ class _SetQ(nn.Module):
     def __init__(self, continuous: int, width: int, scale_m: float, reach_m: float) -> None:
         super().__init__()
         self.scale_m, self.reach_m = scale_m, reach_m
-        self.trunk = SetTrunk(3, continuous, width)
+        self.trunk = SetTrunk(3, continuous + 1, width)
         self.device_out = nn.Linear(width, 1)
         self.idle_out = nn.Linear(width, 1)
 
     def all_choices(self, context: Context, valid: Tensor, offset: Tensor, continuous: Tensor) -> Tensor:
         token, globals_ = context
         # the link that will carry the packet is the one after the move, which a disc of reach_m limits
-        move = self.reach_m * continuous / continuous.norm(dim=1, keepdim=True).clamp(min=1.0)
+        length = continuous.square().sum(dim=1, keepdim=True).add(1e-8).sqrt()
+        move = self.reach_m * continuous / length.clamp(min=1.0)
         after = _place(offset - move[:, None], self.scale_m)
-        hidden, whole = self.trunk(token, globals_, valid, after, continuous)
+        # a move takes time in proportion to its length, a cone that a smooth network cannot make from w alone
+        hidden, whole = self.trunk(token, globals_, valid, after, torch.cat([continuous, length], dim=1))
         devices = torch.where(valid > 0, self.device_out(hidden).squeeze(-1), NEVER)
         return torch.cat([self.idle_out(whole), devices], dim=-1)
 

@@ -33,9 +33,13 @@ def to_tensors(observation: Any, device: torch.device | str = "cpu") -> Observat
 
 
 def to_batch(transitions: Transitions, kind: ObservationKind, scenario: Scenario) -> Batch:
-    """Rows as a batch with raw rewards; the action is the one commanded, which is what a policy can choose."""
+    """Rows as a batch with raw rewards. The displacement is the executed one.
+
+    A move that the border cancelled is then a hover, as it was in the air; learned as commanded, flying against the
+    border would look like the one place where moving is free.
+    """
     before, after = transitions.observations(kind, scenario)
-    continuous = np.clip(transitions.displacement_m / scenario.airframe.max_displacement_m, -1.0, 1.0)
+    continuous = np.clip(transitions.executed_displacement_m / scenario.airframe.max_displacement_m, -1.0, 1.0)
     return Batch(
         observation=to_tensors(before),
         action=HybridAction(
