@@ -20,6 +20,7 @@ class BcConfig(AgentConfig):
 
     name: Literal["bc"] = "bc"
     diffusion: DiffusionConfig = DiffusionConfig()
+    learning_rate: float = Field(1e-3, gt=0, description="of Adam")
     displacement_weight: float = Field(3.0, gt=0, description="weight of a continuous entry; 1 in the paper")
     actor_average: float = Field(0.995, ge=0, lt=1, description="decay of the actor's moving average")
 

@@ -33,7 +33,14 @@ class DiffusionSacConfig(AgentConfig):
 
     name: Literal["diffusion_sac"] = "diffusion_sac"
     diffusion: DiffusionConfig = DiffusionConfig()
-    bc_weight: float = Field(0.5, ge=0, le=1, description="eta of eq. (actor_loss_all)")
+    learning_rate: float = Field(1e-3, gt=0, description="of Adam")
+    discount: float = Field(
+        0.98, ge=0, lt=1, description="gamma, per step or per second; short runs learn sooner from it"
+    )
+    polyak: float = Field(
+        0.03, gt=0, le=1, description="rate of the target critic; a chain of 1/gamma backups needs many"
+    )
+    bc_weight: float = Field(0.02, ge=0, le=1, description="eta of eq. (actor_loss_all)")
     cql_weight: float = Field(0.0, ge=0, description="alpha of eq. (crtici_CQL); 0 skips the penalty")
     cql_samples: int = Field(10, ge=1, description="uniform displacements in the penalty's sum")
     guidance: Literal["expectation", "straight_through", "softmax"] = Field(
@@ -52,7 +59,7 @@ class DiffusionSacConfig(AgentConfig):
         "by the batch's mean |Q|; or not at all (paper). Without a scale eta has no meaning",
     )
     displacement_weight: float = Field(3.0, gt=0, description="weight of a continuous entry in L_bc; 1 in the paper")
-    actor_average: float = Field(0.995, ge=0, lt=1, description="decay of the target actor; 0: no average")
+    actor_average: float = Field(0.98, ge=0, lt=1, description="decay of the target actor; 0: no average")
     greedy_choice: bool = Field(
         True,
         description="d' of the backup and d of a decision: the critic's best for the actor's w; false: the actor's own "

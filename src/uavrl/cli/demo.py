@@ -30,7 +30,7 @@ class Demo:
 
     out: Path = Path("out/demo")
     """directory for summary.json, the table, figures, the page of a flight and the policy"""
-    updates: int = 4_500
+    updates: int = 2_500
     """gradient steps of Diffusion-SAC; behaviour cloning takes as many"""
     episodes: int = 100
     """unseen layouts to judge on"""
@@ -61,13 +61,18 @@ class Demo:
             heuristics = {name: side.submit(_fly_heuristic, name, environments) for name in HEURISTICS}
             _single_thread()
             policy = _train("diffusion_sac", self.out / "policy", self.updates, self.seed, True)
-            flown = {"diffusion_sac": fly(policy, environments, name="diffusion_sac", show_progress=True)}
-            flown["bc"] = fly(bc.result(), environments, name="bc", show_progress=True)
+            flown = {"diffusion_sac": fly(policy, environments, name="diffusion_sac", deterministic=True)}
+            flown["bc"] = fly(bc.result(), environments, name="bc", deterministic=True)
             console.print("Waiting for the planner's flights.")
             flown |= {name: future.result() for name, future in heuristics.items()}
         order = [*HEURISTICS, "bc", "diffusion_sac"]
         judgement = judge(
-            {}, environments, flown={name: flown[name] for name in order}, data=transitions, command="uavrl demo"
+            {},
+            environments,
+            flown={name: flown[name] for name in order},
+            data=transitions,
+            deterministic=True,  # the two learned policies; see docs/evaluation.md
+            command="uavrl demo",
         )
         _write(self.out, judgement)
         _show(self.out, judgement, time.monotonic() - started)
@@ -98,7 +103,7 @@ def _train(agent: str, out: Path, updates: int, seed: int, visible: bool) -> Any
         updates=updates,
         seed=seed,
         save_every=max(1, updates // 4),
-        evaluate_every=max(1, updates // 6),
+        evaluate_every=max(1, updates // 4),
         log_every=max(1, min(50, updates // 10)),
     )
     learner = OfflineLearner(config, transitions)

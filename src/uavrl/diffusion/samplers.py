@@ -47,7 +47,9 @@ def straight_through_clamp(x: Tensor) -> Tensor:
     alone lets guidance push a sample out for ever, for what it is clamped to no longer changes: predicted noise grew
     until it was worse than none. So a gradient passes unless it leads further out.
     """
-    clamped: Tensor = _Clamp.apply(x) if torch.is_grad_enabled() else x.clamp(-1, 1)
+    if not torch.is_grad_enabled():
+        return x.clamp(-1, 1)
+    clamped: Tensor = _Clamp.apply(x)  # type: ignore[no-untyped-call]  # torch leaves Function.apply without types
     return clamped
 
 
@@ -62,7 +64,8 @@ class _Clamp(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
         (x,) = ctx.saved_tensors
-        return gradient * ((x.abs() <= 1) | (gradient * x > 0))  # descent goes against the gradient
+        kept: Tensor = gradient * ((x.abs() <= 1) | (gradient * x > 0))  # descent goes against the gradient
+        return kept
 
 
 def ddpm(

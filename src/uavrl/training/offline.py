@@ -28,7 +28,7 @@ from uavrl.training.policy import AgentPolicy
 
 Evaluator = Callable[[AgentPolicy], dict[str, float]]
 
-PRESET_UPDATES = {"default": 60_000, "paper": 70_000}  # the paper: J = 150 passes over 30 k rows in batches of 64
+PRESET_UPDATES = {"default": 30_000, "paper": 70_000}  # the paper: J = 150 passes over 30 k rows in batches of 64
 
 
 class TrainConfig(BaseModel):
