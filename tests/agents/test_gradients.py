@@ -17,6 +17,7 @@ from uavrl.agents.bc import BehaviourCloning
 from uavrl.agents.diffusion_actor import ChainNoise
 from uavrl.agents.diffusion_sac import DiffusionSac
 from uavrl.agents.sac import Sac
+from uavrl.diffusion import straight_through_clamp
 from uavrl.networks import Denoiser
 from uavrl.networks.devices import SetDenoiser
 from uavrl.networks.mlp import MlpDenoiser
@@ -42,7 +43,7 @@ def make(kind: Kind, **changes: Any) -> DiffusionSac:
 
 def without_kinks(made: DiffusionSac) -> DiffusionSac:
     """Both Q functions equal: their minimum is then as smooth as they are, as finite differences need."""
-    made.critic.second.load_state_dict(made.critic.first.state_dict())  # type: ignore[operator,union-attr]  # modules
+    made.critic.second.load_state_dict(made.critic.first.state_dict())  # type: ignore[union-attr]  # modules
     return made
 
 
@@ -294,10 +295,10 @@ def test_guidance_that_pulls_outwards_for_ever_does_not_ruin_the_predicted_noise
     data = batch("mlp", ROWS)
 
     def pull(observation: object, vector: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        w, z = module.straight_through_clamp(vector[:, :2]), functional.softmax(2 * vector[:, 2:], dim=1)
+        w, z = straight_through_clamp(vector[:, :2]), functional.softmax(2 * vector[:, 2:], dim=1)
         return -(3 * w.sum(dim=1) + 3 * z[:, 1]).mean(), {}
 
-    made.guidance_loss = pull  # type: ignore[method-assign,assignment]  # a critic with a constant slope
+    made.guidance_loss = pull  # type: ignore[method-assign]  # a critic with a constant slope
     generator, cloning = torch.Generator().manual_seed(0), []
     for _ in range(150):
         cloning.append(float(made.update(data, generator)["bc_loss"]))
@@ -333,12 +334,14 @@ def test_scaled_guidance_pulls_equally_whatever_the_scale_of_q(q_scale: str, fac
                         value.mul_(factor)
             made.critic.shift(shift)
         slopes.append(
-            torch.cat([g.flatten() for g in torch.autograd.grad(actor_loss(made), made.actor.denoiser.parameters())])
+            torch.cat(
+                [g.flatten() for g in torch.autograd.grad(actor_loss(made), list(made.actor.denoiser.parameters()))]
+            )
         )
     torch.testing.assert_close(*slopes, rtol=0.01, atol=1e-3 * float(slopes[0].abs().max()))
     unscaled = make("mlp", q_scale="none", bc_weight=0.0)
     raw = torch.cat(
-        [g.flatten() for g in torch.autograd.grad(actor_loss(unscaled), unscaled.actor.denoiser.parameters())]
+        [g.flatten() for g in torch.autograd.grad(actor_loss(unscaled), list(unscaled.actor.denoiser.parameters()))]
     )
     assert not torch.allclose(raw, slopes[0], rtol=0.01)
 
@@ -351,7 +354,7 @@ def test_sac_losses_train_their_own_networks(kind: Kind) -> None:
     critic = made.critic_loss(data, noise(1, ROWS, 2))[0]
     assert all(value is not None for value in gradients(critic, made.critic).values())
     assert all(value is None for value in gradients(critic, made.actor).values())
-    assert torch.autograd.grad(critic, made.log_temperature, retain_graph=True, allow_unused=True) == (None,)
+    assert torch.autograd.grad(critic, made.log_temperature, retain_graph=True, allow_unused=True)[0] is None
     actor, metrics = made.actor_loss(data, noise(2, ROWS, 2))
     found = gradients(actor, made.actor)
     assert all(value is not None for value in found.values())
@@ -359,7 +362,7 @@ def test_sac_losses_train_their_own_networks(kind: Kind) -> None:
         rows = found["out.weight"]
         assert rows is not None
         assert (rows.norm(dim=1) > 1e-6).all()  # means, deviations and logits
-    assert torch.autograd.grad(actor, made.log_temperature, retain_graph=True, allow_unused=True) == (None,)
+    assert torch.autograd.grad(actor, made.log_temperature, retain_graph=True, allow_unused=True)[0] is None
     assert not any(parameter.requires_grad for parameter in made.target.parameters())
     # a temperature rises while its entropy is too small, and falls while it is too large
     wanted = torch.tensor([made.config.continuous_entropy, made.config.choice_entropy * math.log(5)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -144,7 +145,8 @@ def test_actor_loss_weighs_cloning_against_guidance(clip_x0: bool) -> None:
 @pytest.mark.parametrize("name", ["bc", "diffusion_sac"])
 @pytest.mark.parametrize("weight", [1.0, 3.0])
 def test_cloning_is_the_weighted_mean_of_squared_noise_errors(name: str, weight: float) -> None:
-    made = agent(name, "mlp", displacement_weight=weight, **({"bc_weight": 1.0} if name == "diffusion_sac" else {}))
+    settings: dict[str, Any] = {"bc_weight": 1.0} if name == "diffusion_sac" else {}
+    made = agent(name, "mlp", displacement_weight=weight, **settings)
     data, step, eps = batch("mlp", ROWS), torch.tensor([1, 2, 3, 4, 5, 1]), noise(3, ROWS, 2 + D)
     if isinstance(made, BehaviourCloning):
         loss = made.actor_loss(data, step, eps)[0]
@@ -211,7 +213,7 @@ def test_losses_of_sac(kind: Kind) -> None:
         p = np.exp(output.logits[0].double().numpy())
         p /= p.sum()
         q = [q_of(critic, observation, torch.from_numpy(w).float(), d).min() for d in range(D)]
-        return sum(p[d] * (q[d] - 0.7 * math.log(p[d])) for d in range(D)) - 0.3 * log_w
+        return float(sum(p[d] * (q[d] - 0.7 * math.log(p[d])) for d in range(D))) - 0.3 * log_w
 
     expected = 0.0
     for i in range(ROWS):

@@ -63,18 +63,17 @@ def test_the_bounds_are_nearly_reached_where_all_devices_are_in_one_place(scenar
     assert 1.0 <= flown.step_age_s[0] / step_mean_age_bound_s(scenario, int(flown.steps[0])) < 1.06
 
 
-@pytest.mark.parametrize("fading", ["none", "ergodic"])
 @pytest.mark.parametrize(
     "scenario",
     [
-        PRESETS["released"].replace(max_steps=150),
-        PRESETS["released"].replace(max_steps=150, **UNEQUAL),
-        PRESETS["realistic"].replace(time_budget_s=25.0, min_idle_s=0.02),
+        PRESETS["released"].replace(fading="none", max_steps=100),
+        PRESETS["released"].replace(fading="ergodic", max_steps=60),
+        PRESETS["released"].replace(fading="none", max_steps=60, **UNEQUAL),
+        PRESETS["realistic"].replace(fading="none", time_budget_s=15.0, min_idle_s=0.02),
     ],
-    ids=["released", "unequal", "realistic"],
+    ids=["released", "ergodic", "unequal", "realistic"],
 )
-def test_nothing_simulated_is_below(scenario: Scenario, fading: str) -> None:
-    scenario = scenario.replace(fading=fading)
+def test_nothing_simulated_is_below(scenario: Scenario) -> None:
     layout, start = layouts_and_starts(scenario, 6, 1_000_000)
     clustered = np.clip(start[:, None] + 0.02 * (layout - 500.0), 0.0, 1000.0)  # where the bounds bite
     for name, where in itertools.product(POLICIES, (layout, clustered)):
@@ -90,7 +89,7 @@ def test_hovering_above_everything_is_the_general_bound_and_farther_is_worse() -
     layout = np.full((1, 10, 2), 300.0)
     above, beside = (hover_age_bound_s(NONE, layout, np.array([[x, 300.0]]), 100.0)[0] for x in (300.0, 500.0))
     assert above == pytest.approx(float(mean_age_bound_s(NONE, 100.0)))
-    assert beside > 1.2 * above
+    assert beside > 1.1 * above
 
 
 def test_a_device_out_of_reach_is_as_old_as_the_flight() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from tests.policies.flying import fly, layouts_and_starts
 from uavrl.policies import POLICIES, SimulatorView, make_policy
-from uavrl.policies.planner import Plan, Rollouts, better_plan, possible_actions
+from uavrl.policies.planner import Plan, Rollouts, _cheapest, better_plan, possible_actions
 from uavrl.scenario import PRESETS, Scenario
 from uavrl.simulation.dynamics import advance, initial_state
 from uavrl.simulation.state import Draws, FlightAction, SimState
@@ -71,27 +71,27 @@ def test_rollouts_equal_the_simulator_where_nothing_is_random(name: str) -> None
     state = initial_state(start, scenario.traffic.devices)
     state = replace(state, age_s=generator.uniform(0, 1.4, state.age_s.shape), step=np.full(24, 5))
     plan = some_plans(24, start, generator)
+    tolerance = 1e-2 if name == "lost" else 1e-3  # the tables blur the edge of the range
     rolled = Rollouts(scenario).cost(layout, state, plan)
-    np.testing.assert_allclose(rolled, simulated_cost(scenario, layout, state, plan, None, 0), rtol=1e-3)
+    np.testing.assert_allclose(rolled, simulated_cost(scenario, layout, state, plan, None, 0), rtol=tolerance)
     hop = np.clip(start + generator.uniform(-15, 15, (24, 2)), 1.0, 999.0) - start
     first = FlightAction(hop, generator.integers(0, scenario.traffic.devices + 1, 24))
     rolled = Rollouts(scenario).cost(layout, state, plan, first)
-    np.testing.assert_allclose(rolled, simulated_cost(scenario, layout, state, plan, first, 0), rtol=1e-3)
+    np.testing.assert_allclose(rolled, simulated_cost(scenario, layout, state, plan, first, 0), rtol=tolerance)
 
 
 def test_rollouts_are_the_mean_over_lost_packets() -> None:
-    """Round robin where a third of the packets is lost: choices do not depend on ages, so means must agree."""
+    """Round robin where many packets are lost: choices do not depend on ages, so means must agree."""
     scenario = PRESETS["realistic"].replace(max_transmission_s=0.25, reward="per_step", max_steps=80)
-    layout, start = (np.repeat(values, 400, axis=0) for values in layouts_and_starts(scenario, 1, 8))
+    layout, start = (np.repeat(values, 100, axis=0) for values in layouts_and_starts(scenario, 1, 8))
     state = initial_state(start, 10)
-    in_turn = Plan(np.zeros(400, dtype=np.int64), start, np.ones(400), np.zeros(400), np.ones(400, dtype=bool))
+    in_turn = Plan(np.zeros(100, dtype=np.int64), start, np.ones(100), np.zeros(100), np.ones(100, dtype=bool))
     sampled = simulated_cost(scenario, layout, state, in_turn, None, 1)
-    rolled = Rollouts(scenario).cost(layout[:1], initial_state(start[:1], 10), in_turn.map(lambda value: value[:1]))[0]
-    assert rolled == pytest.approx(sampled.mean(), abs=4.0 * sampled.std() / 20.0)
-    certain = scenario.replace(max_transmission_s=None)
-    assert Rollouts(certain).cost(layout[:1], initial_state(start[:1], 10), in_turn.map(lambda value: value[:1]))[
-        0
-    ] != pytest.approx(sampled.mean(), rel=0.1)
+    rolled = Rollouts(scenario).cost(layout, state, in_turn)[0]
+    error = sampled.std() / 10.0
+    assert abs(rolled - sampled.mean()) < 4.0 * error
+    certain = Rollouts(scenario.replace(max_transmission_s=None)).cost(layout, state, in_turn)[0]
+    assert abs(certain - sampled.mean()) > 8.0 * error  # without losses it is another number
 
 
 @pytest.mark.parametrize("preset", ["released", "paper"])
@@ -138,14 +138,16 @@ def test_the_planner_minimises_the_scenarios_own_objective() -> None:
 
 
 def test_the_present_plan_wins_ties() -> None:
-    """Nothing costs anything: the plan stays, and its own action is taken."""
-    scenario = PRESETS["released"].replace(age_weight=0.0, fading="none", energy_reference_j=1e30)
+    """Where energy alone counts, to idle is free whatever one waits for or strides with: nothing changes."""
+    scenario = PRESETS["released"].replace(age_weight=0.0)
     layout, start = layouts_and_starts(scenario, 3, 5)
     view = SimulatorView(scenario, layout, initial_state(start, 10))
-    plan = some_plans(3, start, np.random.default_rng(1))
+    plan = Plan(np.full(3, 3), start, np.full(3, 7.0), np.full(3, np.inf), np.zeros(3, dtype=bool))
     kept = better_plan(Rollouts(scenario), view, plan)
     for field in vars(plan):
         np.testing.assert_array_equal(getattr(kept, field), getattr(plan, field))
+    costs = np.array([[1.0, 1.0, 1.0 - 1e-12], [1.0, 0.5, 0.5], [2.0, 2.0, 1.9]])
+    assert _cheapest(costs).tolist() == [0, 1, 2]
 
 
 def test_a_flight_does_not_depend_on_its_batch() -> None:

@@ -13,11 +13,16 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from uavrl import ENVIRONMENT_ID
 from uavrl.errors import ScenarioError
 from uavrl.scenario import load_scenario
 from uavrl.simulation import environment
-from uavrl.simulation.environment import DataCollectionEnv, DataCollectionVectorEnv, check_layout, random_positions
+from uavrl.simulation.environment import (
+    ENVIRONMENT_ID,
+    DataCollectionEnv,
+    DataCollectionVectorEnv,
+    check_layout,
+    random_positions,
+)
 from uavrl.simulation.state import Draws
 
 LAYOUT = np.random.default_rng(0).uniform(0, 1000, (10, 2))

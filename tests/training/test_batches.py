@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -73,7 +75,7 @@ REWARD = np.array([-10.0, -1.0, -2.0, -3.0, -4.0])
         (RewardConfig(transform="zscore", clip=None), False, (REWARD - REWARD.mean()) / REWARD.std()),
     ],
 )
-def test_rewards_are_transformed_as_the_setting_says(config: RewardConfig, terminates: bool, expected: object) -> None:
+def test_rewards_are_transformed_as_the_setting_says(config: RewardConfig, terminates: bool, expected: Any) -> None:
     shift, factor = reward_transform(REWARD, config, terminates)
     found = transformed(torch.from_numpy(REWARD), shift, factor, config)
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-5)

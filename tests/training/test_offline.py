@@ -94,7 +94,7 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint_and_ends_the_same(tmp_pat
 
 def test_one_seed_one_result_and_no_global_generator(tmp_path: Path, flown: Transitions) -> None:
     before = torch.random.get_rng_state()
-    found = []
+    found: list[Any] = []
     for seed in (3, 3, 4):
         learner = OfflineLearner(config(seed=seed, updates=2), flown)
         learner.run(tmp_path / str(len(found)), quiet)
@@ -162,7 +162,7 @@ def test_divergence_stops_the_run_and_the_last_good_checkpoint_stays(
             return metrics | {"critic_loss": torch.tensor(float("nan"))}
         return metrics | {"q": torch.tensor(-2.0 * learner.q_limit)}
 
-    learner.agent.update = update  # type: ignore[method-assign]  # what a run that diverges does
+    learner.agent.update = update  # type: ignore[method-assign,assignment]  # what a run that diverges does
     with pytest.raises(
         DivergenceError, match="diverged: " + ("critic_loss = nan" if sick == "nan" else "q = -")
     ) as error:

@@ -99,9 +99,8 @@ def test_the_log_is_what_the_environment_did(tmp_path: Path) -> None:
     assert not log.terminated.any()
     # flown again from what was logged, without fading: the same
     zero = np.zeros(len(log))
-    before = SimState(
-        *(a.astype(np.float64) for a in (log.position_m, log.age_s, log.energy_j, log.used_j)), zero, log.step
-    )
+    position, ages, last, used = (a.astype(np.float64) for a in (log.position_m, log.age_s, log.energy_j, log.used_j))
+    before = SimState(position, ages, last, used, zero, log.step)
     action = FlightAction(log.displacement_m.astype(np.float64), log.device)
     draws = Draws(np.zeros((len(log), 2)), np.zeros(len(log)))
     after, outcome = advance(SCENARIO, log.layout_m.astype(np.float64), before, action, draws)
@@ -186,7 +185,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_the_last_checkpoint_stays(t
         metrics = real(*arguments)
         return metrics if learner.updates < 8 else metrics | {"actor_loss": torch.tensor(float("nan"))}
 
-    learner.agent.update = update  # type: ignore[method-assign]  # what a run that diverges does
+    learner.agent.update = update  # type: ignore[method-assign,assignment]  # what a run that diverges does
     with pytest.raises(DivergenceError, match="actor_loss = nan after 8 updates"):
         learner.run(tmp_path, quiet, save_every=10)
     resumed = OnlineLearner.resume(tmp_path)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -71,14 +72,13 @@ def test_a_checkpoint_of_something_else_is_refused_in_one_line(tmp_path: Path) -
     tensors = agent_tensors(agent("bc", "mlp"))
     config = agent("bc", "mlp").config.model_dump(mode="json")
     spaces = {"observation": 7, "continuous": 2, "choices": 5}
-    for number, document in enumerate(
-        (
-            {},
-            {"config": config},
-            {"config": {**config, "name": "td3"}, "spaces": spaces},
-            {"config": config, "spaces": 3},
-        )
-    ):
+    documents: list[dict[str, Any]] = [
+        {},
+        {"config": config},
+        {"config": {**config, "name": "td3"}, "spaces": spaces},
+        {"config": config, "spaces": 3},
+    ]
+    for number, document in enumerate(documents):
         save_checkpoint(tmp_path / str(number), document, tensors)
         with pytest.raises(CheckpointError, match="no agent of this version"):
             load_policy(tmp_path / str(number), SCENARIO)

@@ -64,7 +64,7 @@ def report(**returns: float) -> dict[str, Any]:
     return {
         "policies": {
             name: {
-                "return": {"mean": value, "low": value - 10, "high": value + 10},
+                "return": {"mean": value, "low": value - 10, "high": value + 20},
                 "excess_cost": {"mean": -value / 200 - 1, "low": -value / 200 - 1.1, "high": -value / 200 - 0.9},
                 "age_per_second_s": {"mean": -value / 100, "low": -value / 110, "high": -value / 90},
             }
@@ -78,12 +78,12 @@ def test_bars_have_their_lengths_intervals_and_numbers(drawn: list[Figure], tmp_
     left, right = drawn[0].axes
     assert [bar.get_width() for bar in left.patches] == [-300.0, -200.0]  # type: ignore[attr-defined]  # they are rectangles
     assert [bar.get_width() for bar in right.patches] == pytest.approx([50.0, 0.0])  # type: ignore[attr-defined]  # as above
-    assert [text.get_text() for text in left.texts] == ["-300 [-310, -290]", "-200 [-210, -190]"]
+    assert [text.get_text() for text in left.texts] == ["-300 [-310, -280]", "-200 [-210, -180]"]
     assert right.texts[0].get_text() == "50.0 [40.0, 60.0]"
     assert [label.get_text() for label in left.get_yticklabels()] == ["tdm", "planner"]
     whiskers = left.collections[0]
     assert isinstance(whiskers, LineCollection)
-    assert whiskers.get_segments()[0][:, 0].tolist() == [-310.0, -290.0]
+    assert whiskers.get_segments()[0][:, 0].tolist() == [-310.0, -280.0]
     assert left.get_ylim()[0] > left.get_ylim()[1]  # the first on top
 
 
@@ -92,7 +92,7 @@ def test_an_outlier_is_cut_and_does_not_hide_the_others(drawn: list[Figure], tmp
     axes = drawn[0].axes[0]
     assert axes.get_xlim()[0] > -350
     assert [bar.get_hatch() is not None for bar in axes.patches] == [False, False, False, True]
-    assert axes.texts[3].get_text() == "-5000 [-5010, -4990]"
+    assert axes.texts[3].get_text() == "-5000 [-5010, -4980]"
     assert "the bar is cut" in axes.get_xlabel()
 
 
