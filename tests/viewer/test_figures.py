@@ -174,10 +174,16 @@ def test_the_hero_shows_ages_over_time_at_a_readable_size(devices: int, drawn: l
 
 def test_nothing_is_clipped_at_the_edge_of_a_file(tmp_path: Path) -> None:
     figures.trajectories([flight("hover", devices=30, width_m=4000.0, max_steps=5)] * 2, tmp_path / "paths.png")
-    with Image.open(tmp_path / "paths.png") as image:
-        pixels = np.asarray(image.convert("RGB"))
-    edges = np.concatenate([pixels[:3].reshape(-1, 3), pixels[-3:].reshape(-1, 3), pixels[:, :3].reshape(-1, 3)])
-    assert (edges == 255).all()
+    figures.objective_bars(report(a_policy_of_a_rather_long_name=-30_000.0, planner=-2000.0), tmp_path / "bars.png")
+    for name in ("paths.png", "bars.png"):
+        with Image.open(tmp_path / name) as image:
+            pixels = np.asarray(image.convert("RGB"))
+        rows, columns = (
+            np.concatenate([pixels[:3], pixels[-3:]]),
+            np.concatenate([pixels[:, :3], pixels[:, -3:]], axis=1),
+        )
+        assert (rows == 255).all()
+        assert (columns == 255).all()
 
 
 def test_a_file_that_cannot_be_written_is_told(tmp_path: Path) -> None:

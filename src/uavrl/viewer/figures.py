@@ -251,13 +251,14 @@ def hero(episode: Episode, out: Path) -> None:
     norm = Normalize(0.0, max(float(np.percentile(episode.age_s, 98)), 1e-9))
     colours = ScalarMappable(norm, AGE_COLOURS)
     mean_age_s = _device_ages_s(episode)
-    figure = Figure(figsize=(8.0, 3.7), dpi=200, layout="constrained")
+    figure = Figure(figsize=(8.0, 4.0), dpi=200, layout="constrained")
+    figure.suptitle(f"{_short(episode.policy)}: return {episode.total_reward:.4g}", fontsize=11)
     left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.15])
     draw_area(left, episode.scenario)
     inks = ["white" if norm(age) > 0.6 else INK for age in mean_age_s]
     _dots(left, episode, colours.to_rgba(mean_age_s), inks, 2.9)
     _path(left, episode)
-    left.set_title(f"{_short(episode.policy)}: flight, mean age of each device", fontsize=10)
+    left.set_title("flight, and mean age of each device", fontsize=10)
     devices = len(episode.layout_m)
     rows = np.arange(devices + 1) + 0.5
     right.pcolormesh(episode.time_s, rows, episode.age_s[1:].T, norm=norm, cmap=AGE_COLOURS)
