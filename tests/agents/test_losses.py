@@ -83,10 +83,15 @@ def test_penalty_is_the_log_of_the_integral_over_all_actions(kind: Kind, samples
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("greedy", [False, True])
 @pytest.mark.parametrize(("cql_weight", "per"), [(0.0, "step"), (0.7, "second")])
-def test_critic_loss_of_diffusion_sac(kind: Kind, cql_weight: float, per: str) -> None:
-    """The target is of the target critic at the argmax action of the target actor; all four networks differ here."""
-    made = diffusion_sac(kind, cql_weight=cql_weight, cql_samples=2, discount=0.8, discount_per=per, huber=None)
+def test_critic_loss_of_diffusion_sac(kind: Kind, cql_weight: float, per: str, greedy: bool) -> None:
+    """The target is of the target critic at the target actor's w, and its argmax d or the target critic's best d.
+
+    All four networks differ here.
+    """
+    settings = {"cql_weight": cql_weight, "cql_samples": 2, "discount": 0.8, "discount_per": per, "huber": None}
+    made = diffusion_sac(kind, **settings, greedy_choice=greedy)
     for seed, network in enumerate((made.critic, made.target, made.actor.denoiser, made.actor.average)):
         disturb(network, seed)
     data = batch(kind, ROWS)
@@ -100,7 +105,8 @@ def test_critic_loss_of_diffusion_sac(kind: Kind, cql_weight: float, per: str) -
     expected, penalty = 0.0, 0.0
     for i in range(ROWS):
         w, choice = vector[i, :2].clamp(-1, 1), int(np.argmax(vector[i, 2:].numpy()))
-        value = q_of(made.target, row(data.next_observation, i), w, choice).min()
+        following = [q_of(made.target, row(data.next_observation, i), w, d).min() for d in range(D)]
+        value = max(following) if greedy else following[choice]
         target = float(data.reward[i]) + discount_of(data, i, per, 0.8) * value
         q = q_of(made.critic, row(data.observation, i), data.action.continuous[i], int(data.action.choice[i]))
         expected += 0.5 * float(((q - target) ** 2).sum()) / ROWS

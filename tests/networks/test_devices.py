@@ -172,9 +172,15 @@ def test_features_against_numbers_worked_out_by_hand() -> None:
         ]
     )
     tokens, globals_, valid, offset = features({"uav": uav, "devices": devices}, 500.0)
-    torch.testing.assert_close(tokens[0, 0], torch.tensor([0.6, 0.8, 1.0, 2.0, 1.0, 1.5, 1.0, 1.0]), rtol=0, atol=1e-3)
-    torch.testing.assert_close(tokens[0, 1], torch.tensor([0.0, -1.0, 1.0, 0.0, 0.0, 0.5, 2.0, 1.0]), rtol=0, atol=1e-3)
-    torch.testing.assert_close(globals_[0], torch.tensor([-0.5, 1.0, 1.0, 0.7, 2.0, 1.0]), rtol=0, atol=1e-3)
+    torch.testing.assert_close(
+        tokens[0, 0], torch.tensor([0.6, 0.8, 1.0, 2.0, (torch.e**2 - 1) / 5, 1.0, 1.5, 1.0, 1.0]), rtol=0, atol=1e-3
+    )
+    torch.testing.assert_close(
+        tokens[0, 1], torch.tensor([0.0, -1.0, 1.0, 0.0, 0.0, 0.0, 0.5, 2.0, 1.0]), rtol=0, atol=1e-3
+    )
+    torch.testing.assert_close(
+        globals_[0], torch.tensor([-0.5, 1.0, 1.0, 0.7, 2.0, 1.0, (torch.e**2 - 1) / 10]), rtol=0, atol=1e-3
+    )
     assert valid.tolist() == [[1.0, 1.0, 0.0]]
     assert torch.equal(offset, devices[..., :2])
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -88,6 +87,14 @@ class TestPathLoss:
             10 ** ((10 * math.log10(125.9) - 79.46 + 114.0) / 10)
         )
 
+    def test_link_puts_the_equations_together(self) -> None:
+        distance = math.sqrt(100.0**2 + 300.0**2)
+        theta = math.degrees(math.asin(100.0 / distance))
+        sight = 1 / (1 + 10 * math.exp(-0.6 * (theta - 10)))
+        loss_db = 20 * math.log10(4 * math.pi * 2e9 * distance / 3e8) + 1.0 * sight + 20.0 * (1 - sight)
+        snr_db = 10 * math.log10(125.9) - loss_db + 114.0
+        assert at(300.0) == pytest.approx((theta, sight, 10 ** (snr_db / 10)))
+
 
 class TestRate:
     def test_is_shannons(self) -> None:
@@ -142,57 +149,3 @@ class TestFading:
     def test_a_large_factor_hardly_fades(self) -> None:
         normal = np.random.default_rng(0).standard_normal((1000, 2))
         assert channel.fading_power(normal, np.full(1000, 1e8)) == pytest.approx(np.ones(1000), abs=1e-3)
-
-    @pytest.mark.parametrize("factor", [0.0, 1.0, 10.0, 31.6])
-    def test_density_is_the_noncentral_chi_square(self, factor: float) -> None:
-        power = np.linspace(0.01, 5.0, 50)
-        scale = 2 * (factor + 1)
-        exact = scale * (stats.ncx2.pdf(scale * power, 2, 2 * factor) if factor else stats.chi2.pdf(scale * power, 2))
-        assert channel.fading_density(power, np.full(50, factor)) == pytest.approx(exact, rel=1e-6, abs=1e-9)
-
-
-class TestExpectedService:
-    """One attempt's mean time and chance of success, against sampling the same channel."""
-
-    @pytest.mark.parametrize("fading", ["rayleigh", "rician"])
-    @pytest.mark.parametrize("horizontal_m", [50.0, 400.0, 900.0])
-    def test_with_an_outage_limit(self, fading: str, horizontal_m: float) -> None:
-        link = Channel.model_validate({"fading": fading, "max_transmission_s": 0.3})
-        generator = np.random.default_rng(0)
-        count = 200_000
-        elevation, los, snr = at(horizontal_m, link)
-        sight = generator.random(count) < los if fading == "rician" else np.zeros(count, dtype=bool)
-        factor = np.where(sight, channel.rician_factor(np.array(elevation), link), 0.0)
-        power = channel.fading_power(generator.standard_normal((count, 2)), factor)
-        seconds = 2e6 / (1e6 * np.log2(1 + snr * power))
-        mean, arrival = channel.expected_service(np.array([horizontal_m]), np.array([2e6]), link)
-        assert mean[0] == pytest.approx(np.minimum(seconds, 0.3).mean(), rel=5e-3)
-        assert arrival[0] == pytest.approx((seconds <= 0.3).mean(), abs=5e-3)
-
-    def test_without_a_limit_it_is_time_at_the_mean_rate(self) -> None:
-        where, bits = np.array([0.0, 300.0]), np.array([2e6, 1e6])
-        _, _, snr = channel.link_snr(where, PAPER)
-        expected: dict[str, Any] = {
-            "none": bits / channel.rate_bps(snr, 1e6),
-            "rayleigh": bits / channel.ergodic_rate_bps(snr, 1e6),
-            "ergodic": bits / channel.ergodic_rate_bps(snr, 1e6),
-        }
-        for fading, seconds in expected.items():
-            mean, arrival = channel.expected_service(where, bits, Channel.model_validate({"fading": fading}))
-            assert mean == pytest.approx(seconds, rel=1e-9)
-            assert arrival.tolist() == [1.0, 1.0]
-
-    def test_rician_mean_rate_against_sampling(self) -> None:
-        link = Channel(fading="rician")
-        generator = np.random.default_rng(1)
-        elevation, los, snr = at(300.0, link)
-        factor = np.where(generator.random(200_000) < los, channel.rician_factor(np.array(elevation), link), 0.0)
-        power = channel.fading_power(generator.standard_normal((200_000, 2)), factor)
-        mean, _ = channel.expected_service(np.array([300.0]), np.array([2e6]), link)
-        assert mean[0] == pytest.approx(2e6 / (1e6 * np.log2(1 + snr * power)).mean(), rel=2e-3)
-
-    def test_nothing_arrives_later_than_the_limit(self) -> None:
-        link = Channel(fading="none", max_transmission_s=0.2)
-        mean, arrival = channel.expected_service(np.array([0.0, 900.0]), np.array([2e6, 2e6]), link)
-        assert mean == pytest.approx([0.1084, 0.2], abs=5e-5)
-        assert arrival.tolist() == [1.0, 0.0]

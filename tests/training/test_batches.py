@@ -16,7 +16,7 @@ from uavrl.training.batches import reward_transform, spaces_of, to_batch, transf
 
 
 @pytest.mark.parametrize("kind", ["paper", "devices"])
-def test_a_batch_holds_what_a_policy_saw_and_commanded(kind: ObservationKind) -> None:
+def test_a_batch_holds_what_a_policy_saw_and_flew(kind: ObservationKind) -> None:
     scenario = small_scenario()
     log = fly(scenario, steps=20)
     data = to_batch(log, kind, scenario)
@@ -35,7 +35,9 @@ def test_a_batch_holds_what_a_policy_saw_and_commanded(kind: ObservationKind) ->
                 for name, value in expected.items():
                     np.testing.assert_allclose(found[name][row], value[0], rtol=1e-5, atol=1e-3)
     reach = scenario.airframe.max_displacement_m
-    np.testing.assert_allclose(data.action.continuous.numpy() * reach, log.displacement_m, rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(
+        data.action.continuous.numpy() * reach, log.executed_displacement_m, rtol=1e-5, atol=1e-4
+    )
     assert not np.allclose(log.displacement_m, log.executed_displacement_m)  # commands of the box, moves of the disc
     assert data.action.choice.tolist() == log.device.tolist()
     assert data.reward.tolist() == log.reward.tolist()

@@ -112,7 +112,7 @@ def test_the_learning_rate_falls_on_a_cosine_and_the_log_has_every_row(tmp_path:
         rates.append(learner.agent.optimisers["critic"].param_groups[0]["lr"])
 
     learner.run(tmp_path, report)
-    expected = 3e-4 * 0.5 * (1 + np.cos(np.pi * np.arange(12) / 12))
+    expected = learner.config.agent.learning_rate * 0.5 * (1 + np.cos(np.pi * np.arange(12) / 12))
     np.testing.assert_allclose(rates, expected, rtol=1e-6)
     assert [row["step"] for row in rows(tmp_path)] == [2, 4, 6, 8, 10, 12]
     assert {"q", "bc_loss", "guided_q", "critic_gradient", "actor_gradient"} <= set(rows(tmp_path)[0])
