@@ -90,7 +90,13 @@ def test_critic_loss_of_diffusion_sac(kind: Kind, cql_weight: float, per: str, g
 
     All four networks differ here.
     """
-    settings = {"cql_weight": cql_weight, "cql_samples": 2, "discount": 0.8, "discount_per": per, "huber": None}
+    settings: dict[str, Any] = {
+        "cql_weight": cql_weight,
+        "cql_samples": 2,
+        "discount": 0.8,
+        "discount_per": per,
+        "huber": None,
+    }
     made = diffusion_sac(kind, **settings, greedy_choice=greedy)
     for seed, network in enumerate((made.critic, made.target, made.actor.denoiser, made.actor.average)):
         disturb(network, seed)

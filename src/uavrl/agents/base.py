@@ -74,6 +74,7 @@ class Agent(ABC):
     spaces: Spaces
     networks: nn.ModuleDict  # everything that is saved, targets and averages included
     optimisers: dict[str, torch.optim.Optimizer]
+    acts_best_deterministically = False  # whether a trial should fly its deterministic action rather than a sample
 
     @abstractmethod
     def update(self, batch: Batch, generator: torch.Generator) -> Metrics:

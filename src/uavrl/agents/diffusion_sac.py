@@ -84,6 +84,7 @@ class DiffusionSac(Agent):
     """Diffusion-SAC for declared spaces."""
 
     config: DiffusionSacConfig
+    acts_best_deterministically = True  # the chain's noise is jitter, and every metre of it costs time
 
     def __init__(self, spaces: Spaces, config: DiffusionSacConfig) -> None:
         self.spaces, self.config = spaces, config

@@ -108,7 +108,7 @@ def trial_flights(transitions: Transitions, scenario: Scenario, episodes: int = 
         environments = replace(environments, layout_m=np.repeat(layouts.astype(np.float64), episodes, axis=0))
 
     def evaluate(policy: AgentPolicy) -> dict[str, float]:
-        flown = fly(policy, environments, deterministic=True)
+        flown = fly(policy, environments, deterministic=policy.agent.acts_best_deterministically)
         returns = (flown.reward * flown.active).sum(axis=0)
         return {"return": float(returns.mean()), "return_median": float(np.median(returns))}
 
