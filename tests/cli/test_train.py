@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -138,6 +139,7 @@ def test_trial_flights_are_of_their_own_seed_and_of_the_datas_layout_where_it_is
 
     class Spy:
         name, needs = "spy", "devices"
+        agent = SimpleNamespace(acts_best_deterministically=True)
 
         def reset(self, count: int) -> None: ...
 
