@@ -108,12 +108,12 @@ def test_a_set_network_acts_for_another_number_of_devices(name: str) -> None:
 @pytest.mark.parametrize("deterministic", [False, True])
 @pytest.mark.parametrize("name", NAMES)
 def test_a_padded_device_is_never_chosen(name: str, deterministic: bool) -> None:
-    made, seen = agent(name, "devices"), observation("devices", 200)
+    seen = observation("devices", 200)
     assert isinstance(seen, dict)
     seen["devices"][:, 1, 5] = 0.0
-    for candidates in (1, 3) if name == "diffusion_sac" else (1,):
-        if name == "diffusion_sac":
-            made = agent(name, "devices", candidates=candidates)
+    settings = [{"candidates": 1, "greedy_choice": False}, {"candidates": 3, "greedy_choice": False}, {"candidates": 2}]
+    for changes in settings if name == "diffusion_sac" else [{}]:
+        made = agent(name, "devices", **changes)
         action = made.act(seen, generator=generator(), deterministic=deterministic)
         assert 2 not in action.choice.tolist()
 
@@ -181,7 +181,7 @@ def test_weights_of_another_shape_are_refused_in_one_line(name: str, kind: Kind)
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_of_several_candidates_the_best_by_the_smaller_q_is_taken(kind: Kind) -> None:
-    made = diffusion_sac(kind, candidates=5)
+    made = diffusion_sac(kind, candidates=5, greedy_choice=False)
     disturb(made.critic, 1)
     seen = observation(kind, 30)
 
@@ -199,6 +199,22 @@ def test_of_several_candidates_the_best_by_the_smaller_q_is_taken(kind: Kind) ->
     ):  # with many candidates, no worse than the best choice at a fixed displacement, but for few rows
         best = made.critic.all_choices(made.critic.encode(seen), torch.zeros(30, 2)).amin(dim=0).amax(dim=1)
     assert (many > best - 0.1).float().mean() > 0.8
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_greedy_choice_is_the_critics_best_for_the_actors_displacement(kind: Kind) -> None:
+    seen = observation(kind, 40)
+    for deterministic in (False, True):
+        made = {greedy: diffusion_sac(kind, greedy_choice=greedy) for greedy in (False, True)}
+        own, greedy = (
+            made[key].act(seen, generator=generator(1), deterministic=deterministic) for key in (False, True)
+        )
+        assert torch.equal(own.continuous, greedy.continuous)
+        with torch.no_grad():
+            critic = made[True].critic
+            best = critic.all_choices(critic.encode(seen), greedy.continuous).amin(dim=0).argmax(dim=1)
+        assert torch.equal(greedy.choice, best)
+        assert not torch.equal(own.choice, best)
 
 
 def test_the_average_acts_not_the_network_in_training() -> None:
@@ -229,6 +245,12 @@ def test_the_papers_preset_is_the_papers() -> None:
     assert (config.bc_weight, config.cql_weight, config.gradient) == (0.5, 0.0, "full_chain")
     assert (config.diffusion.schedule, config.diffusion.variance, config.diffusion.clip_x0) == ("linear", "beta", False)
     assert (config.reward.transform, config.reward.clip, config.candidates) == ("zscore", None, 1)
+    assert (config.q_scale, config.huber, config.greedy_choice, config.displacement_weight) == (
+        "none",
+        None,
+        False,
+        1.0,
+    )
 
 
 @pytest.mark.parametrize(("name", "which"), [("sca", "default"), ("bc", "papers")])

@@ -150,8 +150,8 @@ def test_the_data_of_a_perceptron_set_its_normalisers(flown: Transitions) -> Non
 def test_divergence_stops_the_run_and_the_last_good_checkpoint_stays(
     tmp_path: Path, flown: Transitions, sick: str
 ) -> None:
-    """Sick from update 6 on; the checkpoint of update 5 stays, though update 10 would save and no row was due at 10."""
-    learner = OfflineLearner(config(log_every=7, updates=30), flown)
+    """Sick from update 6 on; the checkpoint of update 5 stays, though update 10 saves and no row is due before 30."""
+    learner = OfflineLearner(config(log_every=100, updates=30), flown)
     real = learner.agent.update
 
     def update(*arguments: Any) -> dict[str, torch.Tensor]:
