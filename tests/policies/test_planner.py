@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import wilcoxon
 
 from tests.policies.flying import fly, layouts_and_starts
 from uavrl.policies import POLICIES, SimulatorView, make_policy
@@ -162,9 +163,10 @@ def test_a_flight_does_not_depend_on_its_batch() -> None:
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("preset", list(PRESETS))
 def test_the_planner_beats_every_heuristic_on_each_preset(preset: str) -> None:
-    """100 random layouts, paired over equal draws."""
+    """100 random layouts, paired over equal draws: in the mean, and by rank, for a rare deep fade sways the mean."""
     scenario = PRESETS[preset]
     planner = fly(scenario, make_policy("planner"), 100).returns
     for other in sorted(set(POLICIES) - {"planner"}):
         gain = planner - fly(scenario, make_policy(other), 100).returns
-        assert gain.mean() > 2.0 * gain.std() / 10.0, other
+        assert gain.mean() > 0.0, other
+        assert wilcoxon(gain, alternative="greater").pvalue < 1e-4, other
