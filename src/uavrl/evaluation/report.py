@@ -233,7 +233,7 @@ def notes(scenario: Scenario, estimates: Mapping[str, Mapping[str, Estimate]]) -
         always, seldom = returns_of_duty(scenario, (1, 5))
         if seldom > always:
             yield (
-                "This objective makes idling optimal: with every device overhead, serving in each step returns "
+                "This objective pays for serving rarely: with every device overhead, serving in each step returns "
                 f"{always:.4g}, in one step of five {seldom:.4g}."
             )
     if DATA in estimates:
