@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
 from uavrl.errors import ConfigError
-from uavrl.networks.devices import SetActor, SetCritic, SetDenoiser
-from uavrl.networks.interfaces import Actor, Critic, Denoiser, Observation
-from uavrl.networks.mlp import MlpActor, MlpCritic, MlpDenoiser, Normaliser
+from uavrl.networks.devices import SetActor, SetChoiceActor, SetConditional, SetCritic, SetDenoiser
+from uavrl.networks.interfaces import Actor, ChoiceActor, Conditional, Critic, Denoiser, Observation
+from uavrl.networks.mlp import MlpActor, MlpChoiceActor, MlpConditional, MlpCritic, MlpDenoiser, Normaliser
 
 
 class Spaces(BaseModel):
@@ -21,7 +21,9 @@ class Spaces(BaseModel):
 
     observation: int | None = Field(description="entries of a flat observation; none: a set of devices")
     continuous: int = Field(ge=1, description="continuous entries of an action, each in [-1, 1]")
-    choices: int = Field(ge=2, description="choices of an action; for a set of devices, K + 1")
+    choices: int = Field(
+        ge=1, description="choices of an action; for a set of devices, K + 1; 1: the action is continuous alone"
+    )
 
 
 class NetworkConfig(BaseModel):
@@ -49,6 +51,18 @@ def _flat_size(spaces: Spaces, config: NetworkConfig) -> int:
 def _needs_set(spaces: Spaces, config: NetworkConfig) -> None:
     if spaces.observation is not None:
         raise ConfigError(f"network.kind = {config.kind!r} takes a set of devices, allowed here: 'mlp'")
+    if spaces.choices < 2:
+        raise ConfigError("choices = 1, allowed for a set of devices: K + 1, idling and at least one device")
+
+
+def _perceptron(config: NetworkConfig) -> dict[str, Any]:
+    """What every perceptron takes from the configuration."""
+    return {
+        "log": config.log_inputs,
+        "width": config.width,
+        "depth": config.depth,
+        "activation": config.activation,
+    }
 
 
 def make_critic(spaces: Spaces, config: NetworkConfig) -> Critic:
@@ -61,11 +75,8 @@ def make_critic(spaces: Spaces, config: NetworkConfig) -> Critic:
         spaces.continuous,
         spaces.choices,
         heads=config.choice_heads,
-        log=config.log_inputs,
-        width=config.width,
-        depth=config.depth,
-        activation=config.activation,
         layer_norm=config.layer_norm,
+        **_perceptron(config),
     )
 
 
@@ -77,11 +88,8 @@ def make_denoiser(spaces: Spaces, config: NetworkConfig) -> Denoiser:
     return MlpDenoiser(
         _flat_size(spaces, config),
         spaces.continuous + spaces.choices,
-        log=config.log_inputs,
-        width=config.width,
-        depth=config.depth,
-        activation=config.activation,
         layer_norm=False,
+        **_perceptron(config),
     )
 
 
@@ -94,12 +102,38 @@ def make_actor(spaces: Spaces, config: NetworkConfig) -> Actor:
         _flat_size(spaces, config),
         spaces.continuous,
         spaces.choices,
-        log=config.log_inputs,
-        width=config.width,
-        depth=config.depth,
-        activation=config.activation,
         layer_norm=False,
+        **_perceptron(config),
     )
+
+
+def make_choice_actor(spaces: Spaces, config: NetworkConfig) -> ChoiceActor:
+    """The Gaussian-categorical actor whose displacement depends on its choice."""
+    return _choice_actor(spaces, config, spaces.continuous)
+
+
+def make_classifier(spaces: Spaces, config: NetworkConfig) -> ChoiceActor:
+    """A categorical over the choice alone: means and deviations are empty."""
+    return _choice_actor(spaces, config, 0)
+
+
+def _choice_actor(spaces: Spaces, config: NetworkConfig, continuous: int) -> ChoiceActor:
+    if config.kind == "devices":
+        _needs_set(spaces, config)
+        return SetChoiceActor(continuous, width=config.width, scale_m=config.scale_m)
+    flat = _flat_size(spaces, config)
+    return MlpChoiceActor(flat, continuous, spaces.choices, layer_norm=False, **_perceptron(config))
+
+
+def make_conditional(
+    spaces: Spaces, config: NetworkConfig, *, outputs: int, inputs: int = 0, choice: bool = False
+) -> Conditional:
+    """A function of s, of `inputs` further numbers, and of a choice where `choice`."""
+    if config.kind == "devices":
+        _needs_set(spaces, config)
+        return SetConditional(inputs, outputs, choice=choice, width=config.width, scale_m=config.scale_m)
+    flat, choices = _flat_size(spaces, config), spaces.choices if choice else 0
+    return MlpConditional(flat, inputs, choices, outputs, layer_norm=False, **_perceptron(config))
 
 
 def fit_normalisers(networks: nn.Module, observation: Observation) -> None:

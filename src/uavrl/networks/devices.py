@@ -11,8 +11,18 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from uavrl.networks.interfaces import Actor, ActorOutput, Context, Critic, Denoiser, Observation
-from uavrl.networks.mlp import bounded_log_std, step_embedding
+from uavrl.networks.interfaces import (
+    Actor,
+    ActorOutput,
+    ChoiceActor,
+    ChoiceActorOutput,
+    Conditional,
+    Context,
+    Critic,
+    Denoiser,
+    Observation,
+)
+from uavrl.networks.mlp import bounded_log_std, choice_output, step_embedding
 
 TOKEN_FEATURES = 9
 GLOBAL_FEATURES = 7
@@ -214,3 +224,55 @@ class SetActor(Actor):
         mean, log_std, idle = self.global_out(whole).split([self.continuous, self.continuous, 1], dim=-1)
         devices = torch.where(valid > 0, self.device_out(hidden).squeeze(-1), NEVER)
         return ActorOutput(mean, bounded_log_std(log_std), torch.cat([idle, devices], dim=-1))
+
+
+class SetChoiceActor(ChoiceActor):
+    """A logit, a mean and a log standard deviation from each device's token, those of idling from the global vector."""
+
+    def __init__(self, continuous: int, *, width: int, scale_m: float) -> None:
+        super().__init__()
+        self.scale_m = scale_m
+        self.trunk = SetTrunk(0, 0, width)
+        self.device_out = nn.Linear(width, 1 + 2 * continuous)
+        self.idle_out = nn.Linear(width, 1 + 2 * continuous)
+
+    def forward(self, observation: Observation) -> ChoiceActorOutput:
+        """See `ChoiceActor`."""
+        tokens, globals_, valid, _ = features(observation, self.scale_m)
+        hidden, whole = self.trunk(*self.trunk.encode(tokens, globals_), valid, None, None)
+        raw = torch.cat([self.idle_out(whole)[:, None], self.device_out(hidden)], dim=1)
+        mean, log_std, logits = choice_output(raw)
+        devices = torch.where(valid > 0, logits[:, 1:], NEVER)
+        return ChoiceActorOutput(mean, log_std, torch.cat([logits[:, :1], devices], dim=1))
+
+
+class SetConditional(Conditional):
+    """Outputs from the global vector beside the chosen device's, or the mean device's where there is no choice.
+
+    A choice marks its device's token before the trunk, or the global vector when it is to idle.
+    """
+
+    def __init__(self, inputs: int, outputs: int, *, choice: bool, width: int, scale_m: float) -> None:
+        super().__init__()
+        self.scale_m = scale_m
+        self.trunk = SetTrunk(int(choice), inputs + int(choice), width)
+        self.out = nn.Linear(2 * width, outputs)
+
+    def encode(self, observation: Observation) -> Context:
+        """First layer and validity."""
+        tokens, globals_, valid, _ = features(observation, self.scale_m)
+        return (*self.trunk.encode(tokens, globals_), valid)
+
+    def forward(self, context: Context, inputs: Tensor | None = None, choice: Tensor | None = None) -> Tensor:
+        """See `Conditional`."""
+        token, globals_, valid = context
+        if choice is None:
+            hidden, whole = self.trunk(token, globals_, valid, None, inputs)
+            weight = valid / valid.sum(dim=1, keepdim=True)
+        else:
+            idle, weight = choice[:, :1], choice[:, 1:]
+            extra = idle if inputs is None else torch.cat([inputs, idle], dim=1)
+            hidden, whole = self.trunk(token, globals_, valid, weight[:, :, None], extra)
+        own = (weight[:, None] @ hidden).squeeze(1)
+        outputs: Tensor = self.out(torch.cat([whole, own], dim=1))
+        return outputs

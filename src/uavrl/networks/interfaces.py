@@ -28,6 +28,14 @@ class ActorOutput(NamedTuple):
     logits: Tensor  # (B, D)
 
 
+class ChoiceActorOutput(NamedTuple):
+    """A categorical over the choice and, for each choice, a Gaussian over the continuous part, not squashed."""
+
+    mean: Tensor  # (B, D, C) in (-1, 1)
+    log_std: Tensor  # (B, D, C)
+    logits: Tensor  # (B, D)
+
+
 class Critic(nn.Module, ABC):
     """An ensemble of two Q functions of a hybrid action."""
 
@@ -74,3 +82,23 @@ class Actor(nn.Module, ABC):
     @abstractmethod
     def forward(self, observation: Observation) -> ActorOutput:
         """Distribution of the hybrid action."""
+
+
+class ChoiceActor(nn.Module, ABC):
+    """pi(d | s) pi(w | s, d): the continuous part knows the choice. Without a continuous part, a classifier."""
+
+    @abstractmethod
+    def forward(self, observation: Observation) -> ChoiceActorOutput:
+        """Distribution of the hybrid action."""
+
+
+class Conditional(nn.Module, ABC):
+    """O outputs, a function of s and, where it was made for them, of I further numbers and of a choice."""
+
+    @abstractmethod
+    def encode(self, observation: Observation) -> Context:
+        """The observation's part."""
+
+    @abstractmethod
+    def forward(self, context: Context, inputs: Tensor | None = None, choice: Tensor | None = None) -> Tensor:
+        """(B, O) of inputs (B, I) and a one-hot choice (B, D)."""

@@ -8,7 +8,17 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from uavrl.networks.interfaces import Actor, ActorOutput, Context, Critic, Denoiser, Observation
+from uavrl.networks.interfaces import (
+    Actor,
+    ActorOutput,
+    ChoiceActor,
+    ChoiceActorOutput,
+    Conditional,
+    Context,
+    Critic,
+    Denoiser,
+    Observation,
+)
 
 LOG_STD_RANGE = (-5.0, 2.0)
 
@@ -209,6 +219,80 @@ class MlpActor(Actor):
         hidden = self.hidden(self.first(self.normaliser(_flat(observation))))
         mean, log_std, logits = self.out(hidden).split(self.sizes, dim=-1)
         return ActorOutput(mean, bounded_log_std(log_std), logits)
+
+
+class MlpChoiceActor(ChoiceActor):
+    """Perceptron to a logit, a mean and a log standard deviation for each choice."""
+
+    def __init__(
+        self,
+        size: int,
+        continuous: int,
+        choices: int,
+        *,
+        log: bool,
+        width: int,
+        depth: int,
+        activation: str,
+        layer_norm: bool,
+    ) -> None:
+        super().__init__()
+        self.normaliser = Normaliser(size, log)
+        self.continuous = continuous
+        self.first = nn.Linear(self.normaliser.size, width)
+        self.hidden = hidden_layers(width, depth, activation, layer_norm)
+        self.out = nn.Linear(width, choices * (1 + 2 * continuous))
+
+    def forward(self, observation: Observation) -> ChoiceActorOutput:
+        """See `ChoiceActor`."""
+        hidden = self.hidden(self.first(self.normaliser(_flat(observation))))
+        return choice_output(self.out(hidden).unflatten(-1, (-1, 1 + 2 * self.continuous)))
+
+
+class MlpConditional(Conditional):
+    """Perceptron over [s, inputs, one-hot choice]."""
+
+    def __init__(
+        self,
+        size: int,
+        inputs: int,
+        choices: int,
+        outputs: int,
+        *,
+        log: bool,
+        width: int,
+        depth: int,
+        activation: str,
+        layer_norm: bool,
+    ) -> None:
+        super().__init__()
+        self.normaliser = Normaliser(size, log)
+        self.observation = nn.Linear(self.normaliser.size, width)
+        self.inputs = nn.Linear(inputs, width, bias=False) if inputs else None
+        self.choice = nn.Linear(choices, width, bias=False) if choices else None
+        self.hidden = hidden_layers(width, depth, activation, layer_norm)
+        self.out = nn.Linear(width, outputs)
+
+    def encode(self, observation: Observation) -> Context:
+        """The first layer's observation part."""
+        return (self.observation(self.normaliser(_flat(observation))),)
+
+    def forward(self, context: Context, inputs: Tensor | None = None, choice: Tensor | None = None) -> Tensor:
+        """See `Conditional`."""
+        first = context[0]
+        if self.inputs is not None:
+            first = first + self.inputs(inputs)
+        if self.choice is not None:
+            first = first + self.choice(choice)
+        outputs: Tensor = self.out(self.hidden(first))
+        return outputs
+
+
+def choice_output(raw: Tensor) -> ChoiceActorOutput:
+    """[logit, mean before tanh, log deviation before its bounds] of each choice, (B, D, 1 + 2 C), as a distribution."""
+    continuous = raw.shape[-1] // 2
+    logits, mean, log_std = raw.split([1, continuous, continuous], dim=-1)
+    return ChoiceActorOutput(torch.tanh(mean), bounded_log_std(log_std), logits.squeeze(-1))
 
 
 def bounded_log_std(raw: Tensor) -> Tensor:
