@@ -15,8 +15,8 @@ from torch.distributions import Normal, TanhTransform, TransformedDistribution
 from tests.agents.problems import DEVICES, KINDS, Kind, agent, batch, diffusion_sac, disturb, noise
 from uavrl.agents.base import Batch, bellman_loss, discounts, minimise
 from uavrl.agents.bc import BehaviourCloning
+from uavrl.agents.cql import conservative_penalty
 from uavrl.agents.diffusion_actor import ChainNoise, block_mean
-from uavrl.agents.diffusion_sac import conservative_penalty
 from uavrl.agents.sac import Sac, SquashedSample, soft_value
 from uavrl.networks import Critic, Observation
 from uavrl.networks.interfaces import ActorOutput

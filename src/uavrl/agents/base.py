@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from uavrl.actions import HybridAction
-from uavrl.networks import NetworkConfig, Observation, Spaces
+from uavrl.networks import Critic, NetworkConfig, Observation, Spaces
+from uavrl.networks.interfaces import Context
 
 Metrics = dict[str, Tensor]  # 0-d tensors, read only when they are logged: no host synchronisation in the loop
 
@@ -90,6 +91,11 @@ def discounts(batch: Batch, config: AgentConfig) -> Tensor:
     if config.discount_per == "second":
         return torch.pow(config.discount, batch.duration_s) * (1.0 - batch.terminated)
     return config.discount * (1.0 - batch.terminated)
+
+
+def action_value(critic: Critic, context: Context, action: HybridAction, choices: int) -> Tensor:
+    """Q of hybrid actions, (2, B); the critic sees a legal one-hot of D = `choices`."""
+    return critic.value(context, action.continuous, functional.one_hot(action.choice, choices).float())
 
 
 def bellman_loss(q: Tensor, target: Tensor, huber: float | None) -> Tensor:

@@ -11,7 +11,6 @@ and for z alike: an argmax or a sampler without graph would leave nothing but be
 
 from __future__ import annotations
 
-import math
 from copy import deepcopy
 from typing import Literal, Self
 
@@ -21,7 +20,19 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from uavrl.actions import HybridAction, decode, encode
-from uavrl.agents.base import Agent, AgentConfig, Batch, Metrics, adam, bellman_loss, discounts, minimise, move_towards
+from uavrl.agents.base import (
+    Agent,
+    AgentConfig,
+    Batch,
+    Metrics,
+    action_value,
+    adam,
+    bellman_loss,
+    discounts,
+    minimise,
+    move_towards,
+)
+from uavrl.agents.cql import conservative_penalty
 from uavrl.agents.diffusion_actor import ChainNoise, DiffusionActor, DiffusionConfig, block_mean
 from uavrl.diffusion import add_noise, predict_x0, straight_through_clamp
 from uavrl.networks import Critic, Observation, Spaces, make_critic, repeat
@@ -220,27 +231,3 @@ class DiffusionSac(Agent):
         if self.config.greedy_choice:
             return q.max(dim=-1)
         return q.gather(1, action.choice[:, None]).squeeze(1), action.choice
-
-
-def action_value(critic: Critic, context: Context, action: HybridAction, choices: int) -> Tensor:
-    """Q of hybrid actions, (2, B); the critic sees a legal one-hot of D = `choices`."""
-    return critic.value(context, action.continuous, functional.one_hot(action.choice, choices).float())
-
-
-def conservative_penalty(critic: Critic, context: Context, uniform: Tensor, q_data: Tensor) -> Tensor:
-    """log-sum-exp of Q over actions less Q of the data, eq. (crtici_CQL), mean over rows, both Q functions summed.
-
-    The sum is exact over d and importance-weighted over w: N uniform w of density 2^-C stand for the integral.
-
-    Args:
-        critic: two Q functions.
-        context: encoded observations, B rows.
-        uniform: (B x N, C) displacements, N of each row in a row.
-        q_data: (2, B) Q of the data's actions.
-    """
-    rows = q_data.shape[1]
-    samples = len(uniform) // rows
-    q = critic.all_choices(repeat(context, samples), uniform)  # (2, B N, D)
-    weighted = q + (uniform.shape[1] * math.log(2.0) - math.log(samples))
-    total = weighted.view(2, rows, -1).logsumexp(dim=-1)
-    return (total - q_data).mean(dim=1).sum()

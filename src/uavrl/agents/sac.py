@@ -24,13 +24,14 @@ from uavrl.agents.base import (
     Batch,
     Metrics,
     RewardConfig,
+    action_value,
     adam,
     bellman_loss,
     discounts,
     minimise,
     move_towards,
 )
-from uavrl.networks import Observation, Spaces, make_actor, make_critic
+from uavrl.networks import Actor, Critic, Observation, Spaces, make_actor, make_critic
 from uavrl.networks.interfaces import ActorOutput
 
 
@@ -65,6 +66,71 @@ def soft_value(q: Tensor, log_choice: Tensor, log_density: Tensor, a_c: Tensor, 
     return (log_choice.exp() * (q - a_d * log_choice)).sum(dim=-1) - a_c * log_density
 
 
+def soft_target(
+    target: Critic, output: ActorOutput, noise: Tensor, temperature: Tensor, batch: Batch, config: AgentConfig
+) -> Tensor:
+    """r + gamma (1 - terminated) V(s'), (B,), by the target critic.
+
+    Args:
+        target: two Q functions.
+        output: the policy at s'.
+        noise: (B, C), of w'.
+        temperature: (2,) a_c and a_d; zeros leave the entropies out.
+        batch: B transitions.
+        config: the discount's.
+    """
+    sample = SquashedSample(output, noise)
+    q = target.all_choices(target.encode(batch.next_observation), sample.continuous).amin(dim=0)
+    a_c, a_d = temperature
+    value = soft_value(q, output.logits.log_softmax(dim=-1), sample.log_density, a_c, a_d)
+    return batch.reward + discounts(batch, config) * value
+
+
+def soft_actor_loss(
+    actor: Actor, critic: Critic, temperature: Tensor, observation: Observation, noise: Tensor
+) -> tuple[Tensor, Metrics]:
+    """-V(s) under the current critic; temperature (2,), noise (B, C). The metrics hold both entropies, (2,)."""
+    output = actor(observation)
+    sample = SquashedSample(output, noise)
+    with torch.no_grad():
+        context = critic.encode(observation)
+    q = critic.all_choices(context, sample.continuous).amin(dim=0)
+    log_choice = output.logits.log_softmax(dim=-1)
+    a_c, a_d = temperature
+    loss = -soft_value(q, log_choice, sample.log_density, a_c, a_d).mean()
+    entropy = torch.stack([-sample.log_density.mean(), -(log_choice.exp() * log_choice).sum(dim=-1).mean()])
+    return loss, {"actor_loss": loss.detach(), "entropy": entropy.detach()}
+
+
+def entropy_target(continuous: float, choice: float, choices: int, device: torch.device) -> Tensor:
+    """(2,): what the entropies of w and of d are to be, that of d as a share of log D."""
+    return torch.tensor([continuous, choice * math.log(choices)], device=device)
+
+
+def temperature_loss(log_temperature: Tensor, entropy: Tensor, wanted: Tensor) -> Tensor:
+    """Raises a temperature whose entropy is under its target, lowers the other; all (2,)."""
+    return (log_temperature * (entropy - wanted)).sum()
+
+
+def named_pairs(entropy: Tensor, log_temperature: Tensor) -> Metrics:
+    """Entropies and temperatures, (2,) each, as they are logged."""
+    names = ("entropy_continuous", "entropy_choice", "temperature_continuous", "temperature_choice")
+    return dict(zip(names, (*entropy, *log_temperature.detach().exp()), strict=True))
+
+
+@torch.no_grad()
+def soft_action(
+    actor: Actor, observation: Observation, generator: torch.Generator, deterministic: bool
+) -> HybridAction:
+    """A sample of pi, or its mode."""
+    output = actor(observation)
+    if deterministic:
+        return HybridAction(torch.tanh(output.mean), output.logits.argmax(dim=-1))
+    noise = torch.randn(output.mean.shape, generator=generator, device=generator.device)
+    choice = torch.multinomial(output.logits.softmax(dim=-1), 1, generator=generator).squeeze(-1)
+    return HybridAction(SquashedSample(output, noise).continuous, choice)
+
+
 class Sac(Agent):
     """Hybrid SAC for declared spaces."""
 
@@ -93,58 +159,35 @@ class Sac(Agent):
     def critic_loss(self, batch: Batch, noise: Tensor) -> tuple[Tensor, Metrics]:
         """Bellman error of both Q functions, summed; noise (B, C)."""
         with torch.no_grad():
-            output = self.actor(batch.next_observation)
-            sample = SquashedSample(output, noise)
-            q_next = self.target.all_choices(self.target.encode(batch.next_observation), sample.continuous).amin(dim=0)
-            a_c, a_d = self.log_temperature.exp()
-            value = soft_value(q_next, output.logits.log_softmax(dim=-1), sample.log_density, a_c, a_d)
-            target = batch.reward + discounts(batch, self.config) * value
-        choice = functional.one_hot(batch.action.choice, q_next.shape[-1]).to(target.dtype)
-        q = self.critic.value(self.critic.encode(batch.observation), batch.action.continuous, choice)
+            output, temperature = self.actor(batch.next_observation), self.log_temperature.exp()
+            target = soft_target(self.target, output, noise, temperature, batch, self.config)
+        q = action_value(self.critic, self.critic.encode(batch.observation), batch.action, self.spaces.choices)
         loss = bellman_loss(q, target, self.config.huber)
         return loss, {"critic_loss": loss.detach(), "q": q.detach().mean()}
 
     def actor_loss(self, batch: Batch, noise: Tensor) -> tuple[Tensor, Metrics]:
         """-V(s) under the current critic; noise (B, C)."""
-        output = self.actor(batch.observation)
-        sample = SquashedSample(output, noise)
-        with torch.no_grad():
-            context = self.critic.encode(batch.observation)
-        q = self.critic.all_choices(context, sample.continuous).amin(dim=0)
-        log_choice = output.logits.log_softmax(dim=-1)
-        a_c, a_d = self.log_temperature.detach().exp()
-        loss = -soft_value(q, log_choice, sample.log_density, a_c, a_d).mean()
-        entropy = torch.stack([-sample.log_density.mean(), -(log_choice.exp() * log_choice).sum(dim=-1).mean()])
-        return loss, {"actor_loss": loss.detach(), "entropy": entropy.detach()}
+        return soft_actor_loss(self.actor, self.critic, self.log_temperature.detach().exp(), batch.observation, noise)
 
     def temperature_loss(self, entropy: Tensor, choices: int) -> Tensor:
         """Raises a temperature whose entropy (2,) is under its target, lowers the other."""
-        wanted = torch.tensor(
-            [self.config.continuous_entropy, self.config.choice_entropy * math.log(choices)], device=entropy.device
-        )
-        return (self.log_temperature * (entropy - wanted)).sum()
+        config = self.config
+        wanted = entropy_target(config.continuous_entropy, config.choice_entropy, choices, entropy.device)
+        return temperature_loss(self.log_temperature, entropy, wanted)
 
     def update(self, batch: Batch, generator: torch.Generator) -> Metrics:
         """Critic, actor, temperatures, target."""
-        shape, clip = batch.action.continuous.shape, self.config.gradient_clip
-        loss, metrics = self.critic_loss(batch, torch.randn(shape, generator=generator))
+        shape, clip, device = batch.action.continuous.shape, self.config.gradient_clip, generator.device
+        loss, metrics = self.critic_loss(batch, torch.randn(shape, generator=generator, device=device))
         metrics["critic_gradient"] = minimise(loss, self.critic, self.optimisers["critic"], clip)
-        loss, more = self.actor_loss(batch, torch.randn(shape, generator=generator))
+        loss, more = self.actor_loss(batch, torch.randn(shape, generator=generator, device=device))
         metrics["actor_gradient"] = minimise(loss, self.actor, self.optimisers["actor"], clip)
         entropy = more.pop("entropy")
         loss = self.temperature_loss(entropy, self.spaces.choices)
         minimise(loss, [self.log_temperature], self.optimisers["temperature"], None)
         move_towards(self.target, self.critic, self.config.polyak)
-        names = ("entropy_continuous", "entropy_choice", "temperature_continuous", "temperature_choice")
-        values = (*entropy, *self.log_temperature.detach().exp())
-        return metrics | more | dict(zip(names, values, strict=True))
+        return metrics | more | named_pairs(entropy, self.log_temperature)
 
-    @torch.no_grad()
     def act(self, observation: Observation, *, generator: torch.Generator, deterministic: bool = False) -> HybridAction:
         """A sample of pi, or its mode."""
-        output = self.actor(observation)
-        if deterministic:
-            return HybridAction(torch.tanh(output.mean), output.logits.argmax(dim=-1))
-        noise = torch.randn(output.mean.shape, generator=generator)
-        choice = torch.multinomial(output.logits.softmax(dim=-1), 1, generator=generator).squeeze(-1)
-        return HybridAction(SquashedSample(output, noise).continuous, choice)
+        return soft_action(self.actor, observation, generator, deterministic)
