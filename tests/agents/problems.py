@@ -9,16 +9,16 @@ from torch import Tensor, nn
 
 from uavrl.actions import HybridAction
 from uavrl.agents.base import Agent, Batch
-from uavrl.agents.bc import BcConfig
 from uavrl.agents.diffusion_actor import DiffusionConfig
-from uavrl.agents.diffusion_sac import DiffusionSac, DiffusionSacConfig
-from uavrl.agents.registry import make_agent
+from uavrl.agents.diffusion_sac import DiffusionSac
+from uavrl.agents.registry import AGENTS, PRESETS
 from uavrl.agents.sac import SacConfig
 from uavrl.networks import NetworkConfig, Observation, Spaces, fit_normalisers
 
 Kind = Literal["mlp", "devices"]
 KINDS: tuple[Kind, ...] = ("mlp", "devices")
-NAMES = ("sac", "diffusion_sac", "bc")
+NAMES = ("sac", "diffusion_sac", "cql", "iql", "bcq", "bc", "gaussian_bc")
+CONFIGS = {"sac": SacConfig} | {name: type(presets["default"]) for name, presets in PRESETS.items()}
 DEVICES = 4
 
 
@@ -69,15 +69,9 @@ def batch(kind: Kind, rows: int, seed: int = 0, devices: int = DEVICES) -> Batch
 
 def agent(name: str, kind: Kind, *, seed: int = 0, devices: int = DEVICES, **changes: Any) -> Agent:
     shape = network(kind, **changes.pop("network", {}))
-    config: BcConfig | DiffusionSacConfig | SacConfig
-    if name == "sac":
-        config = SacConfig(network=shape, **changes)
-    elif name == "bc":
-        config = BcConfig(network=shape, **changes)
-    else:
-        config = DiffusionSacConfig(network=shape, **changes)
+    config = CONFIGS[name](network=shape, **changes)
     torch.manual_seed(seed)
-    made = make_agent(spaces(kind, devices), config)
+    made = AGENTS[type(config)](spaces(kind, devices), config)
     fit_normalisers(made.networks, observation(kind, 64, 77, devices))
     return made
 

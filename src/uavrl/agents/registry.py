@@ -2,27 +2,50 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Callable
+from typing import Annotated, Any
 
 from pydantic import Field
 
-from uavrl.agents.base import Agent, RewardConfig
+from uavrl.agents.base import Agent, AgentConfig, RewardConfig
 from uavrl.agents.bc import BcConfig, BehaviourCloning
+from uavrl.agents.bcq import Bcq, BcqConfig
+from uavrl.agents.cql import Cql, CqlConfig
 from uavrl.agents.diffusion_actor import DiffusionConfig
 from uavrl.agents.diffusion_sac import DiffusionSac, DiffusionSacConfig
+from uavrl.agents.gaussian_bc import GaussianBcConfig, GaussianBehaviourCloning
+from uavrl.agents.iql import Iql, IqlConfig
 from uavrl.agents.sac import Sac, SacConfig
 from uavrl.errors import ConfigError
 from uavrl.networks import NetworkConfig, Spaces
 
-OfflineConfig = Annotated[BcConfig | DiffusionSacConfig, Field(discriminator="name")]
-AnyConfig = Annotated[BcConfig | DiffusionSacConfig | SacConfig, Field(discriminator="name")]
+Offline = DiffusionSacConfig | CqlConfig | IqlConfig | BcqConfig | BcConfig | GaussianBcConfig
+OfflineConfig = Annotated[Offline, Field(discriminator="name")]
+AnyConfig = Annotated[Offline | SacConfig, Field(discriminator="name")]
+
+AGENTS: dict[type[AgentConfig], Callable[[Spaces, Any], Agent]] = {
+    DiffusionSacConfig: DiffusionSac,
+    CqlConfig: Cql,
+    IqlConfig: Iql,
+    BcqConfig: Bcq,
+    BcConfig: BehaviourCloning,
+    GaussianBcConfig: GaussianBehaviourCloning,
+    SacConfig: Sac,
+}
 
 # Table I and Section V-B of the paper: as printed, where its text leaves a choice see docs/diffusion-sac.md
 _PAPER_NETWORK = NetworkConfig(kind="mlp", width=256, depth=3, activation="mish", choice_heads=False, log_inputs=False)
 _PAPER_CHAIN = DiffusionConfig(schedule="linear", steps=50, sampler="ddpm", variance="beta", clip_x0=False)
 _PAPER_REWARD = RewardConfig(transform="zscore", clip=None)
+_PAPER_CLONE: dict[str, Any] = {
+    "network": _PAPER_NETWORK,
+    "reward": _PAPER_REWARD,
+    "batch_size": 64,
+    "learning_rate": 3e-4,
+}
+_PAPER_CRITIC: dict[str, Any] = {"discount": 0.99, "polyak": 0.005, "huber": None}  # of the baselines
 
-PRESETS: dict[str, dict[str, BcConfig | DiffusionSacConfig]] = {
+PRESETS: dict[str, dict[str, Offline]] = {
     "diffusion_sac": {
         "default": DiffusionSacConfig(),
         "paper": DiffusionSacConfig(
@@ -43,6 +66,18 @@ PRESETS: dict[str, dict[str, BcConfig | DiffusionSacConfig]] = {
             displacement_weight=1.0,
         ),
     },
+    "cql": {
+        "default": CqlConfig(),
+        "paper": CqlConfig(**_PAPER_CLONE, **_PAPER_CRITIC, cql_weight=1.0),
+    },
+    "iql": {
+        "default": IqlConfig(),
+        "paper": IqlConfig(**_PAPER_CLONE, **_PAPER_CRITIC),
+    },
+    "bcq": {
+        "default": BcqConfig(),
+        "paper": BcqConfig(**_PAPER_CLONE, **_PAPER_CRITIC),
+    },
     "bc": {
         "default": BcConfig(),
         "paper": BcConfig(
@@ -54,26 +89,27 @@ PRESETS: dict[str, dict[str, BcConfig | DiffusionSacConfig]] = {
             displacement_weight=1.0,
         ),
     },
+    "gaussian_bc": {
+        "default": GaussianBcConfig(),
+        "paper": GaussianBcConfig(**_PAPER_CLONE),
+    },
 }
 
 
-def preset(agent: str, name: str) -> BcConfig | DiffusionSacConfig:
-    """Settings by agent and preset.
+def preset(agent: str, name: str) -> Offline:
+    """Settings by agent, hyphens for underscores allowed, and preset.
 
     Raises:
         ConfigError: unknown agent or preset.
     """
-    if agent not in PRESETS:
+    known = agent.replace("-", "_")
+    if known not in PRESETS:
         raise ConfigError(f"agent = {agent!r}, allowed: {', '.join(PRESETS)}")
-    if name not in PRESETS[agent]:
-        raise ConfigError(f"preset = {name!r} of {agent}, allowed: {', '.join(PRESETS[agent])}")
-    return PRESETS[agent][name]
+    if name not in PRESETS[known]:
+        raise ConfigError(f"preset = {name!r} of {agent}, allowed: {', '.join(PRESETS[known])}")
+    return PRESETS[known][name]
 
 
-def make_agent(spaces: Spaces, config: BcConfig | DiffusionSacConfig | SacConfig) -> Agent:
+def make_agent(spaces: Spaces, config: Offline | SacConfig) -> Agent:
     """An untrained agent; weights come from torch's global generator, which the caller seeds."""
-    if isinstance(config, DiffusionSacConfig):
-        return DiffusionSac(spaces, config)
-    if isinstance(config, SacConfig):
-        return Sac(spaces, config)
-    return BehaviourCloning(spaces, config)
+    return AGENTS[type(config)](spaces, config)

@@ -27,7 +27,9 @@ TRIAL_SEED = 500_000  # trial flights during training: neither the data's seeds 
 class Train:
     """Learn a policy from logged flights alone. Interrupted, it goes on where it was with --resume."""
 
-    agent: tyro.conf.Positional[Literal["diffusion_sac", "bc"]]
+    agent: tyro.conf.Positional[
+        Literal["diffusion_sac", "diffusion-sac", "cql", "iql", "bcq", "bc", "gaussian_bc", "gaussian-bc"]
+    ]
     """algorithm"""
     out: Path
     """directory of the run: checkpoint and metrics.jsonl"""
