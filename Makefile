@@ -73,6 +73,7 @@ data: $(STAMP)  ## collect the built-in data anew, with its good and bad parts, 
 	    $(BIN)/uavrl data select runs/$$name/flights.parquet --size $$size --quality $$quality --out runs/$$name-$$quality.parquet || exit 1; \
 	  done || exit 1; \
 	done
+	@echo "to ship them: cp runs/fixed-mixed.parquet src/uavrl/datasets/builtin/fixed.parquet, and layouts likewise"
 
 clean:  ## remove .venv, caches and builds
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
