@@ -35,6 +35,7 @@ COMMANDS: dict[str, Command] = {
     "collect": Command("uavrl.cli.collect:Collect", "log the flights of an agent that learns online"),
     "train": Command("uavrl.cli.train:Train", "learn a policy from logged flights alone"),
     "evaluate": Command("uavrl.cli.evaluate:Evaluate", "fly policies on equal layouts, starts and fading"),
+    "ablate": Command("uavrl.cli.ablate:Ablate", "change one setting of Diffusion-SAC at a time and measure"),
     "demo": Command("uavrl.cli.demo:Demo", "learn a small policy, judge it, and show it"),
     "watch": Command("uavrl.cli.watch:Watch", "make a web page of one flight of a policy"),
 }
