@@ -45,9 +45,6 @@ class DiffusionSacConfig(AgentConfig):
     name: Literal["diffusion_sac"] = "diffusion_sac"
     diffusion: DiffusionConfig = DiffusionConfig()
     learning_rate: float = Field(1e-3, gt=0, description="of Adam")
-    discount: float = Field(
-        0.98, ge=0, lt=1, description="gamma, per step or per second; short runs learn sooner from it"
-    )
     polyak: float = Field(
         0.03, gt=0, le=1, description="rate of the target critic; a chain of 1/gamma backups needs many"
     )
