@@ -12,12 +12,15 @@ from torch import Tensor
 from uavrl.actions import HybridAction
 from uavrl.agents.base import Batch
 from uavrl.agents.bc import BcConfig, BehaviourCloning
+from uavrl.agents.diffusion_actor import DiffusionConfig
 from uavrl.agents.diffusion_sac import DiffusionSac, DiffusionSacConfig
 from uavrl.agents.sac import Sac, SacConfig
+from uavrl.experiments.ablation import BANDIT, UPDATES
+from uavrl.experiments.bandit import SPACES, HybridBandit, fit_bandit, samples
 from uavrl.networks import NetworkConfig, Spaces, fit_normalisers
 
 GAMMA = 0.5
-UPDATES = 250
+CHAIN_UPDATES = 250
 
 
 def chain_batch(rows: int, ended: Literal["terminated", "truncated"], generator: torch.Generator) -> Batch:
@@ -54,10 +57,10 @@ def test_a_chain_of_two_states_has_its_known_values(name: str, ended: Literal["t
     generator = torch.Generator().manual_seed(0)
     fit_normalisers(made.networks, chain_batch(100, ended, generator).observation)
     rates = {key: one.param_groups[0]["lr"] for key, one in made.optimisers.items()}
-    for step in range(UPDATES):
+    for step in range(CHAIN_UPDATES):
         made.update(chain_batch(32, ended, generator), generator)
         for key, one in made.optimisers.items():
-            one.param_groups[0]["lr"] = rates[key] * (1 - step / UPDATES)
+            one.param_groups[0]["lr"] = rates[key] * (1 - step / CHAIN_UPDATES)
     with torch.no_grad():
         states = torch.tensor([[0.0], [1.0]])
         q = made.critic.all_choices(made.critic.encode(states), torch.zeros(2, 1))
@@ -100,18 +103,13 @@ WORTH = torch.tensor([3.0, 0.0, 1.5, 5.0])
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize(
-    "name",
-    [
-        "diffusion_sac",
-        pytest.param(
-            "bc",
-            marks=pytest.mark.xfail(reason="five steps blur: half of the samples lie within .2 of a mode", strict=True),
-        ),
-    ],
-)
+@pytest.mark.parametrize("name", ["diffusion_sac", "bc"])
 def test_two_dimensional_bandit_of_diffusion_q_learning(name: str) -> None:
-    """Four Gaussians: the guided actor keeps to the best, the cloned one to all four in proportion."""
+    """Four Gaussians: the guided actor keeps to the best, the cloned one to all four in proportion.
+
+    Fifty steps for the clone, the paper's M: of its samples 50 % lie within .2 of a mode at M = 5, 84 % at 10, 94 % at
+    20, since a Gaussian step cannot split a sample between modes that are still near each other in the noise.
+    """
     generator = torch.Generator().manual_seed(0)
     corner = torch.randint(0, 4, (ACTIONS,), generator=generator)
     w = (CORNERS[corner] + SIGMA * torch.randn((ACTIONS, 2), generator=generator)).clamp(-1, 1)
@@ -121,7 +119,9 @@ def test_two_dimensional_bandit_of_diffusion_q_learning(name: str) -> None:
     torch.manual_seed(0)
     made: DiffusionSac | BehaviourCloning
     if name == "bc":
-        made = BehaviourCloning(spaces, BcConfig(network=NETWORK, learning_rate=1e-3))
+        made = BehaviourCloning(
+            spaces, BcConfig(network=NETWORK, learning_rate=1e-3, diffusion=DiffusionConfig(steps=50))
+        )
     else:  # the choice changes nothing, so Q has no spread over it to be scaled by
         config = DiffusionSacConfig(network=NETWORK, learning_rate=1e-3, q_scale="absolute", huber=None)
         made = DiffusionSac(spaces, config)
@@ -140,20 +140,16 @@ def test_two_dimensional_bandit_of_diffusion_q_learning(name: str) -> None:
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("seed", range(5))
 def test_hybrid_bandit_keeps_both_parts_of_the_best_action(seed: int) -> None:
-    """Eleven choices, each with a displacement of its own, all logged equally often; rewards .5 apart, noise .5."""
-    generator = torch.Generator().manual_seed(seed)
-    angle = torch.arange(11) * 2 * math.pi / 11
-    modes = 0.8 * torch.stack([angle.cos(), angle.sin()], dim=1)
-    worth = torch.linspace(0, 5, 11)[torch.randperm(11, generator=generator)]
-    choice = torch.randint(0, 11, (ACTIONS,), generator=generator)
-    w = (modes[choice] + SIGMA * torch.randn((ACTIONS, 2), generator=generator)).clamp(-1, 1)
-    reward = worth[choice] + 0.5 * torch.randn(ACTIONS, generator=generator)
+    """Eleven choices, each with a displacement of its own, all logged equally often; rewards .5 apart, noise .5.
+
+    What it takes: the gradient through the whole chain, for one pass from a noised action judges the w logged
+    with one choice beside another choice, a pair that no data hold; a displacement that weighs in L_bc; and a little of
+    the conservative penalty, without which Q beyond a mode's neighbourhood is extrapolated, and guidance follows it.
+    """
+    bandit = HybridBandit.draw(seed)
     torch.manual_seed(seed)
-    config = DiffusionSacConfig(network=NETWORK, learning_rate=1e-3)
-    made = DiffusionSac(Spaces(observation=1, continuous=2, choices=11), config)
-    fit(made, w, choice, reward - reward.median(), 8_000, seed)
-    action, best = sampled(made), int(worth.argmax())
-    right = action.choice == best
-    near = (action.continuous - modes[best]).norm(dim=1) < 0.2
-    assert right.float().mean() >= 0.95
-    assert near.float().mean() >= 0.90
+    agent = DiffusionSac(SPACES, BANDIT)
+    fit_bandit(agent, bandit, UPDATES["bandit"], seed)
+    shares = bandit.score(samples(agent, 9))
+    assert shares["right_choice"] >= 0.95, shares
+    assert shares["near_mode"] >= 0.90, shares

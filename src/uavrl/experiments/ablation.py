@@ -30,9 +30,9 @@ BANDIT = DiffusionSacConfig(
     network=_BANDIT_NETWORK,
     batch_size=64,
     gradient="full_chain",
-    bc_weight=0.5,
+    bc_weight=0.7,
     displacement_weight=10.0,
-    cql_weight=0.03,
+    cql_weight=0.05,
     cql_samples=4,
     greedy_choice=False,
 )
