@@ -3,15 +3,29 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import subprocess
+import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from uavrl.errors import CheckpointError
 from uavrl.training import checkpoint as module
-from uavrl.training.checkpoint import MANIFEST, load_checkpoint, numpy_state, recover, save_checkpoint, set_numpy_state
+from uavrl.training.checkpoint import (
+    MANIFEST,
+    checkpoint_in,
+    load_checkpoint,
+    numpy_state,
+    recover,
+    save_checkpoint,
+    set_numpy_state,
+)
 
 TENSORS = {
     "networks": {"a.weight": torch.arange(6.0).view(2, 3), "flag": torch.tensor([True, False])},
@@ -96,63 +110,156 @@ class Killed(BaseException):
     """The process is gone at this point."""
 
 
-@pytest.mark.parametrize("point", ["save_file", "_sync", "rename 1", "rename 2"])
-def test_a_writer_killed_anywhere_leaves_a_whole_checkpoint(
-    tmp_path: Path, point: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Killed in every call of `point`, one after the other: what recovers is the old checkpoint, or the new one."""
-    for call in range(1, 8):
-        place = tmp_path / f"{point} {call}" / "c"
-        save(place, 1)
-        calls = 0
+def kill(patch: pytest.MonkeyPatch, operation: int, share: float) -> None:
+    """Let the writer be killed within its file operation of this number, when `share` of it is done."""
+    left = operation
 
-        def fail(original: object, at: int) -> object:
-            def run(*arguments: object) -> object:
-                nonlocal calls
-                calls += 1
-                if calls == at:
-                    raise Killed
-                return original(*arguments)  # type: ignore[operator]  # one of the functions below
+    def instead(original: Callable[..., Any], part: Callable[..., None]) -> Callable[..., Any]:
+        def run(*arguments: Any, **options: Any) -> Any:
+            nonlocal left
+            left -= 1
+            if left:
+                return original(*arguments, **options)
+            part(original, *arguments, **options)
+            raise Killed
 
-            return run
+        return run
 
-        with monkeypatch.context() as patch:
-            if point.startswith("rename"):
-                patch.setattr(Path, "rename", fail(Path.rename, int(point[-1])))
-            else:
-                patch.setattr(module, point, fail(getattr(module, point), call))
+    def whole_or_not(original: Callable[..., Any], *arguments: Any, **options: Any) -> None:
+        if share >= 0.5:
+            original(*arguments, **options)
+
+    def cut(original: Callable[..., Any], *arguments: Any, **options: Any) -> None:
+        original(*arguments, **options)
+        path = arguments[0] if original is write_text else arguments[1]
+        os.truncate(path, int(share * path.stat().st_size))
+
+    def some(original: Callable[..., Any], path: Path, **options: Any) -> None:
+        files = sorted(path.iterdir()) if path.exists() else []
+        for file in files[: round(share * len(files))]:
+            file.unlink()
+
+    write_text = Path.write_text
+    patch.setattr(module.shutil, "rmtree", instead(shutil.rmtree, some))
+    patch.setattr(module, "save_file", instead(module.save_file, cut))
+    patch.setattr(module, "_sync", instead(lambda path: None, whole_or_not))
+    patch.setattr(Path, "write_text", instead(write_text, cut))
+    patch.setattr(Path, "mkdir", instead(Path.mkdir, whole_or_not))
+    patch.setattr(Path, "rename", instead(Path.rename, whole_or_not))
+
+
+OPERATIONS = 16  # of a save that replaces: the two last deletions included
+
+
+def writers_come_and_die(folder: Path, plan: list[tuple[int, float, bool]]) -> None:
+    """Writers one after the other, each killed in an operation; between them a reader, and here and there `recover`."""
+    place, newest = folder / "c", 0
+    for number, (operation, share, recovers) in enumerate(plan, start=1):
+        killed = False
+        with pytest.MonkeyPatch.context() as patch:
+            kill(patch, operation, share)  # without the disk's own waiting
             try:
-                save(place, 2)
+                save(place, number)
             except Killed:
-                pass
+                killed = True
+        if recovers:
+            assert (recover(place) is None) == (not place.exists())
+        try:
+            found = load_checkpoint(place).document["step"]
+        except CheckpointError as error:
+            assert "does not exist" in str(error)  # never a damaged one
+            found = 0
+        assert found in (newest, number) if killed else found == number
+        newest = found
+    with pytest.MonkeyPatch.context() as patch:
+        kill(patch, 100, 0.0)
+        save(place, 1000)
+    assert load_checkpoint(place).document["step"] == 1000
+    assert [path.name for path in folder.iterdir()] == ["c"]  # nothing that they left stays
+
+
+@pytest.mark.parametrize("share", [0.0, 0.6])
+@pytest.mark.parametrize("second", range(1, OPERATIONS + 2))
+def test_two_writers_killed_anywhere_leave_a_whole_checkpoint(tmp_path: Path, second: int, share: float) -> None:
+    """What is found is the newest whole one: what was being written when it was in place, else the one before it."""
+    for first in range(1, OPERATIONS + 2):
+        folder = tmp_path / str(first)
+        folder.mkdir()
+        writers_come_and_die(folder, [(100, 0.0, False), (first, share, False), (second, 0.5, False)])
+
+
+PLANS = st.lists(st.tuples(st.integers(1, OPERATIONS + 2), st.floats(0, 1), st.booleans()), min_size=1, max_size=5)
+
+
+@given(plan=PLANS)
+@settings(max_examples=40)
+def test_writers_killed_at_any_byte_leave_a_whole_checkpoint(
+    tmp_path_factory: pytest.TempPathFactory, plan: list[tuple[int, float, bool]]
+) -> None:
+    writers_come_and_die(tmp_path_factory.mktemp("plan"), plan)
+
+
+def test_a_save_that_replaces_has_as_many_operations_as_are_tried(tmp_path: Path) -> None:
+    save(tmp_path / "c", 1)
+    for operation in (OPERATIONS, OPERATIONS + 1):
+        with pytest.MonkeyPatch.context() as patch:
+            kill(patch, operation, 0.0)
+            if operation == OPERATIONS:
+                with pytest.raises(Killed):
+                    save(tmp_path / "c", 2)
             else:
-                assert call > 1
-                break  # fewer calls than that
-        found = recover(place)
-        assert found == place
-        step = load_checkpoint(place).document["step"]
-        renamed = not point.startswith("rename") and calls > 5  # the last sync is of the folder after both renames
-        assert step == (2 if renamed else 1)
-        save(place, 3)  # and the next writer is not in the way of what was left, of the same process number even
-        assert load_checkpoint(place).document["step"] == 3
-        if point.startswith("rename"):
-            break
+                save(tmp_path / "c", 2)
 
 
-def test_leftovers_of_a_killed_writer_of_the_same_number_are_no_obstacle(tmp_path: Path) -> None:
-    save(tmp_path / "c", 1)
-    shutil.copytree(tmp_path / "c", tmp_path / f".c.{os.getpid()}.old")
-    shutil.copytree(tmp_path / "c", tmp_path / f".c.{os.getpid()}.tmp")
-    save(tmp_path / "c", 2)
-    assert load_checkpoint(tmp_path / "c").document["step"] == 2
-    assert [path.name for path in tmp_path.iterdir()] == ["c"]
+SAVE_UNTIL_KILLED = """
+import os, signal, sys, time
+from pathlib import Path
+import torch
+from uavrl.training.checkpoint import load_checkpoint, recover, save_checkpoint
+place, number = Path(sys.argv[1]), 0
+for round in range(12):
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        while True:
+            number += 1
+            save_checkpoint(place, {"step": number}, {"t": {"x": torch.full((200_000,), float(number))}})
+            os.write(writer, b"%d " % number)
+    os.close(writer)
+    seen = os.read(reader, 1 << 16)
+    time.sleep(0.004 * round)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    seen += os.read(reader, 1 << 16)
+    os.close(reader)
+    written = int(seen.split()[-1])
+    if round % 2:
+        recover(place)
+    found = load_checkpoint(place)
+    assert found.document["step"] >= written, (found.document["step"], written)
+    assert (found.tensors["t"]["x"] == found.document["step"]).all()
+    number = found.document["step"]
+print("rounds", round + 1, "step", number)
+"""
 
 
-def test_a_checkpoint_that_was_being_replaced_is_put_back(tmp_path: Path) -> None:
-    save(tmp_path / "c", 1)
-    (tmp_path / "c").rename(tmp_path / ".c.4711.old")
-    assert recover(tmp_path / "c") == tmp_path / "c"
-    assert load_checkpoint(tmp_path / "c").document["step"] == 1
+def test_a_process_that_is_killed_while_writing_leaves_a_whole_checkpoint(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", SAVE_UNTIL_KILLED, str(tmp_path / "c")]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.startswith("rounds 12")
+
+
+def test_a_checkpoint_that_was_being_replaced_is_read_and_put_back(tmp_path: Path) -> None:
+    save(tmp_path / "run" / "checkpoint", 1)
+    (tmp_path / "run" / "checkpoint").rename(tmp_path / "run" / ".checkpoint.old")
+    place = checkpoint_in(tmp_path / "run")
+    assert place == tmp_path / "run" / "checkpoint"
+    assert load_checkpoint(place).document["step"] == 1
+    assert not place.exists()  # a reader beside a writer moves nothing
+    assert recover(place) == place
+    assert load_checkpoint(place).document["step"] == 1
+    assert checkpoint_in(place) == place
 
 
 def test_a_numpy_generator_goes_on_from_json() -> None:

@@ -1,9 +1,17 @@
 """Checkpoints: a directory of JSON and safetensors, written under a temporary name and renamed.
 
-So a run that is cut off at any byte leaves the checkpoint before it. Nothing in it is pickled.
-
     checkpoint.json   what was saved: kind, step, any JSON; size and SHA-256 of every other file
     *.safetensors     tensors: networks, optimisers, generators, whatever the caller names
+
+Nothing in it is pickled. A directory cannot replace another in one step, so saving to NAME goes through three names:
+
+    .NAME.tmp   is written; never read
+    NAME        is renamed to .NAME.old, then .NAME.tmp to NAME
+    .NAME.old   is deleted; read only while there is no NAME, that is, between the two renames
+
+So a writer that is killed at any byte leaves a whole checkpoint: the new one, or the one before it. The names are the
+same for every process, so whatever one leaves behind the next clears away, and no older checkpoint can come back.
+One writer at a time.
 """
 
 from __future__ import annotations
@@ -42,7 +50,7 @@ class Checkpoint:
 def save_checkpoint(directory: Path, document: dict[str, Any], tensors: dict[str, Tensors]) -> None:
     """Write a checkpoint to `directory`, replacing an older one there only when the new one is complete."""
     directory = Path(directory)
-    temporary = directory.with_name(f".{directory.name}.{os.getpid()}.tmp")
+    temporary, old = _temporary(directory), _old(directory)
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
     files = {}
@@ -56,9 +64,8 @@ def save_checkpoint(directory: Path, document: dict[str, Any], tensors: dict[str
     path.write_text(json.dumps({**document, "files": files, "versions": versions}, indent=1), encoding="utf-8")
     _sync(path)
     _sync(temporary)
-    old = directory.with_name(f".{directory.name}.{os.getpid()}.old")
     if directory.exists():
-        shutil.rmtree(old, ignore_errors=True)  # of a killed writer with this number, which containers give again
+        shutil.rmtree(old, ignore_errors=True)  # left by a writer killed while deleting it
         directory.rename(old)
     temporary.rename(directory)
     _sync(directory.parent)
@@ -66,12 +73,14 @@ def save_checkpoint(directory: Path, document: dict[str, Any], tensors: dict[str
 
 
 def load_checkpoint(directory: Path) -> Checkpoint:
-    """Read a checkpoint.
+    """Read a checkpoint; where a writer is, or was killed, between its two renames, the one that was being replaced.
 
     Raises:
         CheckpointError: nothing there, a file missing, cut short or altered.
     """
     directory = Path(directory)
+    if not directory.exists() and _old(directory).exists():
+        directory = _old(directory)
     if not directory.exists():
         raise CheckpointError(f"checkpoint '{directory}' does not exist")
     path = directory / MANIFEST
@@ -98,13 +107,20 @@ def load_checkpoint(directory: Path) -> Checkpoint:
 
 
 def recover(directory: Path) -> Path | None:
-    """The checkpoint at `directory`, putting back one that was being replaced when its writer was killed."""
+    """The checkpoint at `directory`, putting back one that was being replaced when its writer was killed.
+
+    For the next writer alone: one that is still at work would find its second rename barred.
+    """
     directory = Path(directory)
-    if not directory.exists():
-        for old in sorted(directory.parent.glob(f".{directory.name}.*.old")):
-            old.rename(directory)
-            break
+    if not directory.exists() and _old(directory).exists():
+        _old(directory).rename(directory)
     return directory if directory.exists() else None
+
+
+def checkpoint_in(path: Path) -> Path:
+    """Where the checkpoint is, of a run's directory or of the checkpoint's own; nothing is moved."""
+    place = Path(path) / "checkpoint"
+    return place if place.is_dir() or _old(place).is_dir() else Path(path)
 
 
 def agent_tensors(agent: Agent) -> dict[str, Tensors]:
@@ -150,6 +166,14 @@ def numpy_state(generator: np.random.Generator) -> dict[str, Any]:
 def set_numpy_state(generator: np.random.Generator, state: dict[str, Any]) -> None:
     """Inverse of `numpy_state`."""
     generator.bit_generator.state = state
+
+
+def _temporary(directory: Path) -> Path:
+    return directory.with_name(f".{directory.name}.tmp")
+
+
+def _old(directory: Path) -> Path:
+    return directory.with_name(f".{directory.name}.old")
 
 
 def _sync(path: Path) -> None:

@@ -16,7 +16,7 @@ from uavrl.networks import Spaces
 from uavrl.scenario import Scenario, parse_scenario
 from uavrl.simulation.state import FlightAction
 from uavrl.training.batches import OBSERVATION_OF, to_tensors
-from uavrl.training.checkpoint import Checkpoint, load_checkpoint, restore_networks
+from uavrl.training.checkpoint import Checkpoint, checkpoint_in, load_checkpoint, restore_networks
 
 
 class AgentPolicy:
@@ -62,7 +62,7 @@ def load_policy(path: Path, scenario: Scenario, candidates: int | None = None) -
         CheckpointError: missing or damaged; or a perceptron trained with another number of devices.
     """
     path = Path(path)
-    place = path / "checkpoint" if (path / "checkpoint").is_dir() else path
+    place = checkpoint_in(path)
     checkpoint = load_checkpoint(place)
     agent = load_agent(checkpoint, place)
     devices, trained = scenario.traffic.devices, agent.spaces.choices - 1
@@ -79,5 +79,5 @@ def load_policy(path: Path, scenario: Scenario, candidates: int | None = None) -
 def trained_scenario(path: Path) -> Scenario:
     """The scenario that a checkpoint was trained in."""
     path = Path(path)
-    place = path / "checkpoint" if (path / "checkpoint").is_dir() else path
+    place = checkpoint_in(path)
     return parse_scenario(load_checkpoint(place).document["scenario"])
