@@ -1,13 +1,31 @@
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 import torch
 
 from tests.agents.problems import KINDS, Kind, network, observation, spaces
 from uavrl.errors import ConfigError
-from uavrl.networks import fit_normalisers, make_actor, make_critic, make_denoiser
+from uavrl.networks import (
+    Spaces,
+    fit_normalisers,
+    make_actor,
+    make_choice_actor,
+    make_classifier,
+    make_conditional,
+    make_critic,
+    make_denoiser,
+)
 
-MAKERS = [make_actor, make_critic, make_denoiser]
+MAKERS = [
+    make_actor,
+    make_choice_actor,
+    make_classifier,
+    partial(make_conditional, outputs=1),
+    make_critic,
+    make_denoiser,
+]
 
 
 @pytest.mark.parametrize("maker", MAKERS)
@@ -16,6 +34,13 @@ def test_a_network_for_the_other_observation_is_refused(maker: object, kind: Kin
     other: Kind = "mlp" if kind == "devices" else "devices"
     with pytest.raises(ConfigError, match=f"network.kind = '{kind}'.*allowed here: '{other}'"):
         maker(spaces(other), network(kind))  # type: ignore[operator]  # one of MAKERS
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_a_set_of_devices_leaves_at_least_one_choice_beside_idling(maker: object) -> None:
+    alone = Spaces(observation=None, continuous=2, choices=1)
+    with pytest.raises(ConfigError, match="choices = 1, allowed for a set of devices"):
+        maker(alone, network("devices"))  # type: ignore[operator]  # one of MAKERS
 
 
 def test_fit_reaches_every_normaliser_and_leaves_sets_alone() -> None:

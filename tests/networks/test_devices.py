@@ -10,7 +10,7 @@ from torch import Tensor
 
 from tests.agents.problems import disturb, noise, observation
 from uavrl.networks import repeat
-from uavrl.networks.devices import NEVER, SetActor, SetCritic, SetDenoiser, features
+from uavrl.networks.devices import NEVER, SetActor, SetChoiceActor, SetConditional, SetCritic, SetDenoiser, features
 
 ROWS, K = 6, 5
 Devices = dict[str, Tensor]
@@ -57,7 +57,42 @@ def actor() -> Network:
     return run
 
 
-NETWORKS = {"critic": critic, "denoiser": denoiser, "actor": actor}
+def choice_actor() -> Network:
+    made = SetChoiceActor(2, width=16, scale_m=500.0)
+    disturb(made, 3)
+
+    def run(s: Devices, w: Tensor, own: Tensor) -> Tensor:
+        mean, log_std, logits = made(s)
+        return torch.cat([logits[:, :, None], mean, log_std], dim=2)
+
+    return run
+
+
+def conditional() -> Network:
+    """Of every choice in turn."""
+    made = SetConditional(2, 3, choice=True, width=16, scale_m=500.0)
+    disturb(made, 4)
+
+    def run(s: Devices, w: Tensor, own: Tensor) -> Tensor:
+        context, every = made.encode(s), torch.eye(1 + own.shape[1])
+        return torch.stack([made(context, w, one.expand(ROWS, -1)) for one in every], dim=1)
+
+    return run
+
+
+def unconditional() -> SetConditional:
+    made = SetConditional(2, 3, choice=False, width=16, scale_m=500.0)
+    disturb(made, 5)
+    return made
+
+
+NETWORKS = {
+    "critic": critic,
+    "denoiser": denoiser,
+    "actor": actor,
+    "choice actor": choice_actor,
+    "conditional": conditional,
+}
 
 
 @pytest.fixture(params=NETWORKS)
@@ -87,10 +122,12 @@ def test_the_same_weights_take_another_number_of_devices(network: Network, other
     assert found.isfinite().all()
 
 
-def test_a_twin_of_each_device_changes_no_pooled_mean(network: Network) -> None:
+@pytest.mark.parametrize("make", [critic, denoiser, actor, choice_actor])
+def test_a_twin_of_each_device_changes_no_pooled_mean(make: Callable[[], Network]) -> None:
     """Every device twice: means over the set stay, so each output stays; a sum or a count would change them."""
     s, w, own = seen(), noise(1, ROWS, 2), noise(2, ROWS, K)
     twice = {"uav": s["uav"], "devices": torch.cat([s["devices"], s["devices"]], dim=1)}
+    network = make()
     once, found = run(network, s, w, own), run(network, twice, w, torch.cat([own, own], dim=1))
     torch.testing.assert_close(found[:, : K + 1], once, rtol=1e-4, atol=1e-5)
 
@@ -106,11 +143,30 @@ def test_padding_changes_nothing_whatever_it_holds(network: Network) -> None:
         torch.testing.assert_close(found[:, : K + 1], straight, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("make", [critic, actor])
+@pytest.mark.parametrize("make", [critic, actor, choice_actor])
 def test_a_padded_device_is_never_worth_choosing(make: Callable[[], Network]) -> None:
     s = seen()
     s["devices"][:, 2, 5] = 0.0
     assert (run(make(), s, noise(1, ROWS, 2), noise(2, ROWS, K))[:, 3, 0] == NEVER).all()
+
+
+def test_a_function_without_a_choice_is_one_of_the_set() -> None:
+    """Order, twins and padding of the devices change nothing; its further inputs do."""
+    made, s, w = unconditional(), seen(), noise(1, ROWS, 2)
+    with torch.no_grad():
+        straight = made(made.encode(s), w)
+        assert straight.shape == (ROWS, 3)
+        assert straight.std(dim=0).min() > 1e-3
+        padding = torch.full((ROWS, 2, 6), 900.0)
+        padding[:, :, 5] = 0.0
+        for other in (
+            s["devices"][:, [3, 0, 4, 1, 2]],
+            s["devices"].repeat(1, 2, 1),
+            torch.cat([s["devices"], padding], 1),
+        ):
+            found = made(made.encode({"uav": s["uav"], "devices": other}), w)
+            torch.testing.assert_close(found, straight, rtol=1e-4, atol=1e-5)
+        assert not torch.allclose(made(made.encode(s), -w), straight, atol=1e-3)
 
 
 def test_value_is_the_entry_of_all_choices() -> None:

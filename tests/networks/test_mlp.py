@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tests.agents.problems import disturb, noise, observation
-from uavrl.networks.mlp import LOG_STD_RANGE, MlpActor, MlpCritic, MlpDenoiser, Normaliser, step_embedding
+from uavrl.networks.mlp import (
+    LOG_STD_RANGE,
+    MlpActor,
+    MlpChoiceActor,
+    MlpConditional,
+    MlpCritic,
+    MlpDenoiser,
+    Normaliser,
+    step_embedding,
+)
 
 ROWS, K = 5, 4
 Array = NDArray[np.float64]
@@ -109,6 +118,41 @@ def test_actors_deviation_is_bounded_and_its_parts_are_apart() -> None:
     torch.testing.assert_close(mean[0], torch.tensor([0.1, 0.2]))
     torch.testing.assert_close(log_std[0], torch.tensor(LOG_STD_RANGE))
     torch.testing.assert_close(logits[0], torch.tensor([1.0, 2.0, 3.0, 4.0, 5.0]))
+
+
+def test_choice_actor_has_a_mean_and_a_deviation_of_each_choice() -> None:
+    made = MlpChoiceActor(K + 3, 2, 3, log=False, **SHAPE)
+    raw = torch.tensor([[1.0, 0.1, 0.2, -1e3, 1e3], [2.0, 0.3, 40.0, 0.0, 0.0], [3.0, -0.5, -40.0, 1e3, -1e3]])
+    with torch.no_grad():
+        made.out.weight.zero_()
+        made.out.bias.copy_(raw.flatten())
+    mean, log_std, logits = made(seen())
+    low, high = LOG_STD_RANGE
+    middle = (low + high) / 2
+    torch.testing.assert_close(logits[0], torch.tensor([1.0, 2.0, 3.0]))
+    torch.testing.assert_close(mean[0], torch.tensor([[0.1, 0.2], [0.3, 40.0], [-0.5, -40.0]]).tanh())
+    torch.testing.assert_close(log_std[0], torch.tensor([[low, high], [middle, middle], [high, low]]))
+    classifier = MlpChoiceActor(K + 3, 0, 3, log=False, **SHAPE)(seen())
+    assert (classifier.mean.shape, classifier.logits.shape) == ((ROWS, 3, 0), (ROWS, 3))
+
+
+@pytest.mark.parametrize("inputs", [0, 2])
+@pytest.mark.parametrize("choices", [0, 3])
+def test_conditional_is_the_sum_that_its_weights_say(inputs: int, choices: int) -> None:
+    made = MlpConditional(K + 3, inputs, choices, 4, log=False, **SHAPE)
+    disturb(made, 0)
+    s, x = seen(), noise(1, ROWS, 2) if inputs else None
+    d = torch.eye(3)[torch.tensor([0, 2, 1, 0, 2])] if choices else None
+    made.normaliser.fit(s)
+    value = weights(made)
+    first = normalised(s.double().numpy(), False) @ value["observation.weight"].T + value["observation.bias"]
+    if x is not None:
+        first = first + x.double().numpy() @ value["inputs.weight"].T
+    if d is not None:
+        first = first + d.double().numpy() @ value["choice.weight"].T
+    hidden = silu(silu(first) @ value["hidden.1.weight"].T + value["hidden.1.bias"])
+    expected = hidden @ value["out.weight"].T + value["out.bias"]
+    np.testing.assert_allclose(made(made.encode(s), x, d).detach().numpy(), expected, rtol=1e-3, atol=1e-4)
 
 
 def test_layer_norm_makes_the_critic_bounded_in_its_inputs() -> None:
