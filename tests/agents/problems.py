@@ -11,7 +11,7 @@ from uavrl.actions import HybridAction
 from uavrl.agents.base import Agent, Batch
 from uavrl.agents.diffusion_actor import DiffusionConfig
 from uavrl.agents.diffusion_sac import DiffusionSac
-from uavrl.agents.registry import AGENTS, PRESETS
+from uavrl.agents.registry import PRESETS, make_agent
 from uavrl.agents.sac import SacConfig
 from uavrl.networks import NetworkConfig, Observation, Spaces, fit_normalisers
 
@@ -71,7 +71,7 @@ def agent(name: str, kind: Kind, *, seed: int = 0, devices: int = DEVICES, **cha
     shape = network(kind, **changes.pop("network", {}))
     config = CONFIGS[name](network=shape, **changes)
     torch.manual_seed(seed)
-    made = AGENTS[type(config)](spaces(kind, devices), config)
+    made = make_agent(spaces(kind, devices), config)
     fit_normalisers(made.networks, observation(kind, 64, 77, devices))
     return made
 

@@ -110,6 +110,13 @@ def preset(agent: str, name: str) -> Offline:
     return PRESETS[known][name]
 
 
-def make_agent(spaces: Spaces, config: Offline | SacConfig) -> Agent:
-    """An untrained agent; weights come from torch's global generator, which the caller seeds."""
+def make_agent(spaces: Spaces, config: AgentConfig) -> Agent:
+    """An untrained agent; weights come from torch's global generator, which the caller seeds.
+
+    Raises:
+        ConfigError: settings of no agent that is registered here.
+    """
+    if type(config) not in AGENTS:
+        known = ", ".join(one.__name__ for one in AGENTS)
+        raise ConfigError(f"config = {type(config).__name__}, allowed: {known}")
     return AGENTS[type(config)](spaces, config)
