@@ -68,7 +68,11 @@ PRESETS: dict[str, dict[str, Offline]] = {
     },
     "cql": {
         "default": CqlConfig(),
-        "paper": CqlConfig(**_PAPER_CLONE, **_PAPER_CRITIC, cql_weight=1.0),
+        "paper": CqlConfig(
+            **{**_PAPER_CLONE, "network": _PAPER_NETWORK.model_copy(update={"choice_heads": True})},
+            **_PAPER_CRITIC,
+            cql_weight=1.0,
+        ),
     },
     "iql": {
         "default": IqlConfig(),
