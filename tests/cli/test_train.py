@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import json
+import signal
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -45,7 +47,89 @@ def test_a_flat_file_becomes_a_policy(folder: Path, agent: str, capsys: pytest.C
     assert document["config"]["network"]["width"] == 8
     policy = load_policy(folder / "runs/mine", small_scenario())
     assert (policy.name, policy.needs) == (agent, "devices")
-    assert [json.loads(line)["step"] for line in (folder / "runs/mine/metrics.jsonl").read_text().splitlines()] == [4]
+    rows = [json.loads(line) for line in (folder / "runs/mine/metrics.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == [1, 2, 3, 4]
+    assert all(row["support_distance"] > 0 for row in rows)
+    assert "health unknown: 4 rows in the log" in captured.out
+
+
+def test_a_run_ends_with_a_line_on_its_health(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["gaussian_bc", "--data", "log.parquet", "--updates", "120", "--set", "network.width=16"]
+    assert train(*words, "--out", "good", "--set", "learning_rate=0.03") == 0
+    line = capsys.readouterr().out.splitlines()[0]
+    assert line.startswith("healthy: bc_loss "), line
+    rows = (folder / "good/metrics.jsonl").read_text().splitlines()
+    assert len(rows) == 60  # every second: short runs are logged closely enough to be judged
+    assert train(*words, "--out", "bad", "--set", "learning_rate=1e-9") == 0
+    line = capsys.readouterr().out.splitlines()[0]
+    assert line.startswith("unhealthy: bc_loss "), line
+
+
+def test_a_long_run_is_logged_every_200_updates(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from uavrl.training.offline import OfflineLearner
+
+    seen = []
+    monkeypatch.setattr(OfflineLearner, "run", lambda self, out, *_, **__: seen.append(self.config.log_every))
+    words = ["bc", "--out", "run", "--data", "log.parquet", *SMALL]
+    with pytest.raises(FileNotFoundError):  # of metrics.jsonl: nothing ran
+        train(*words)
+    assert seen == [200]
+
+
+def test_tensorboard_that_is_not_installed_is_one_line_before_anything_runs(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    words = ["bc", "--out", "run", "--data", "log.parquet", "--updates", "2", *SMALL, "--tensorboard"]
+    assert train(*words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("uavrl: error: ")
+    assert "extra 'tracking'" in line
+    assert "uavrl[tracking]" in line
+    assert not (folder / "run").exists()
+
+
+def test_the_log_is_written_for_tensorboard_too(folder: Path) -> None:
+    pytest.importorskip("tensorboard")
+    words = ["bc", "--out", "run", "--data", "log.parquet", "--updates", "2", *SMALL, "--tensorboard"]
+    assert train(*words) == 0
+    assert list((folder / "run/tensorboard").glob("events.out.tfevents.*"))
+
+
+def test_a_run_whose_writer_was_killed_between_its_renames_is_one(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["bc", "--out", "run", "--data", "log.parquet", "--updates", "2", *SMALL]
+    assert train(*words) == 0
+    (folder / "run/checkpoint").rename(folder / "run/.checkpoint.old")
+    assert load_policy(folder / "run", small_scenario()).name == "bc"
+    assert train(*words) == 2
+    assert "holds a run already; give --resume" in capsys.readouterr().err
+    assert load_checkpoint(folder / "run/checkpoint").document["step"] == 2
+
+
+def test_an_interrupt_says_what_was_saved_and_how_to_go_on(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from uavrl.training.offline import OfflineLearner
+
+    real = OfflineLearner.step
+
+    def step(self: OfflineLearner) -> object:
+        if self.updates == 3:
+            signal.raise_signal(signal.SIGINT)
+        return real(self)
+
+    monkeypatch.setattr(OfflineLearner, "step", step)
+    words = ["bc", "--out", "run", "--data", "log.parquet", "--updates", "9", *SMALL]
+    assert train(*words) == 130
+    captured = capsys.readouterr()
+    assert captured.err.splitlines()[-2:] == [
+        "saved update 4; the same command with --resume goes on",
+        "uavrl: interrupted",
+    ]
+    assert captured.out == ""
+    assert load_checkpoint(folder / "run/checkpoint").document["step"] == 4
 
 
 def test_a_run_is_not_overwritten_and_goes_on_only_with_its_own_settings(

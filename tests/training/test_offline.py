@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from tests.agents.problems import copies, equal, network
+from tests.agents.problems import CONFIGS, copies, equal, network
 from tests.datasets.flights import fly, small_scenario
+from uavrl.actions import HybridAction
 from uavrl.agents.bc import BcConfig
 from uavrl.agents.diffusion_actor import DiffusionConfig
 from uavrl.agents.diffusion_sac import DiffusionSacConfig
@@ -168,8 +169,31 @@ def test_divergence_stops_the_run_and_the_last_good_checkpoint_stays(
     ) as error:
         learner.run(tmp_path, quiet)
     assert "\n" not in str(error.value)
+    assert f"after 10 updates; '{tmp_path / 'checkpoint'}' keeps update 5, the last good one" in str(error.value)
+    assert "smaller learning_rate or a larger bc_weight" in str(error.value)
     assert load_checkpoint(tmp_path / "checkpoint").document["step"] == 5
     assert load_policy(tmp_path, SCENARIO).name == "diffusion_sac"
+
+
+@pytest.mark.parametrize("due", ["log_every", "save_every", "evaluate_every"])
+def test_weights_that_are_not_finite_are_neither_saved_nor_flown(tmp_path: Path, flown: Transitions, due: str) -> None:
+    """Though every metric of that update, taken before its step, is fine."""
+    learner = OfflineLearner(config("bc", **{"log_every": 100, "save_every": 100, "updates": 30} | {due: 3}), flown)
+    real, tried = learner.agent.update, []
+
+    def update(*arguments: Any) -> dict[str, torch.Tensor]:
+        metrics = real(*arguments)
+        with torch.no_grad():
+            next(learner.agent.networks.parameters()).view(-1)[0] *= float("inf") if learner.updates == 2 else 1.0
+        return metrics
+
+    learner.agent.update = update  # type: ignore[method-assign,assignment]  # what a run that diverges does
+    with pytest.raises(
+        DivergenceError, match=r"weights actor\..* are not finite after 3 updates; no checkpoint had been"
+    ):
+        learner.run(tmp_path, quiet, lambda policy: tried.append(policy) or {})  # type: ignore[func-returns-value]
+    assert not (tmp_path / "checkpoint").exists()
+    assert tried == []
 
 
 def test_a_learning_rate_without_measure_is_found(tmp_path: Path, flown: Transitions) -> None:
@@ -226,6 +250,63 @@ def test_trial_flights_are_logged_and_do_not_disturb_training(tmp_path: Path, fl
     assert asked == ["diffusion_sac"] * 2
     assert [row["step"] for row in rows(tmp_path / "tried") if "return" in row] == [6, 12]
     assert equal(copies(tried.agent.networks), copies(straight.agent.networks))
+
+
+def test_logging_changes_no_bit_of_what_is_learned(tmp_path: Path, flown: Transitions) -> None:
+    """Nor does what is logged, the distance to the data included, depend on how often it is."""
+    found = {}
+    for every in (1, 4):
+        learner = OfflineLearner(config(log_every=every), flown)
+        learner.run(tmp_path / str(every), quiet)
+        found[every] = copies(learner.agent.networks), learner.generator.get_state()
+    assert equal(found[1][0], found[4][0])
+    assert torch.equal(found[1][1], found[4][1])
+    often = {row["step"]: row for row in rows(tmp_path / "1")}
+    assert all(row == often[row["step"]] for row in rows(tmp_path / "4"))
+    assert len({row["support_distance"] for row in often.values()}) > 6
+
+
+def test_the_distance_to_the_data_is_the_policys(flown: Transitions) -> None:
+    learner = OfflineLearner(config(), flown)
+    first = learner.support_distance()
+    assert learner.support_distance() == first > 0
+    support = learner.support
+    assert support is not None
+    learner.agent.act = lambda *_, **__: HybridAction(support.logged[:, 2], None)  # type: ignore[method-assign]  # on the data
+    assert learner.support_distance() == 0.0
+
+
+@pytest.mark.parametrize(
+    ("name", "agent", "q", "loss"),
+    [
+        ("diffusion_sac", {"discount": 0.9, "reward": {"transform": "none", "clip": 1.0}}, (-10.0, 0.0), 1.0),
+        ("diffusion_sac", {"bc_weight": 0.0}, None, None),
+        ("bc", {}, None, 1.0),
+        ("gaussian_bc", {}, None, 2 * np.log(2) + np.log(4)),
+        ("iql", {}, None, None),
+    ],
+)
+def test_what_a_run_is_judged_by_follows_from_settings_and_data(
+    flown: Transitions, name: str, agent: dict[str, Any], q: tuple[float, float] | None, loss: float | None
+) -> None:
+    settings = CONFIGS[name](network=network("devices", width=8), batch_size=8, **agent)
+    learner = OfflineLearner(config().model_copy(update={"agent": settings}), flown)
+    expected = learner.expected
+    if q is not None:
+        assert flown.reward.min() < -1.0
+        assert expected.q == pytest.approx(q)
+        assert learner.q_limit == pytest.approx(100.0)
+    assert expected.q[0] < expected.q[1]
+    assert (expected.bc_loss is None) == (loss is None)
+    assert loss is None or expected.bc_loss == pytest.approx(loss)
+    assert expected.reward_deviation == pytest.approx(float(learner.data.reward.numpy().std()))
+
+
+def test_discounting_per_second_is_judged_by_the_shortest_step(flown: Transitions) -> None:
+    changes = {"discount": 0.9, "discount_per": "second", "reward": {"transform": "none", "clip": 1.0}}
+    learner = OfflineLearner(config(agent=changes), flown)
+    longest = 1.0 / (1.0 - 0.9 ** float(flown.duration_s.min()))
+    assert learner.expected.q[0] == pytest.approx(-longest, rel=1e-5)
 
 
 def test_evaluation_seeds_are_refused() -> None:

@@ -36,14 +36,18 @@ class Collect:
     """a setting of the learner as name=value, such as discount=0.99; repeat it for more"""
     minari: str | None = None
     """id of the Minari dataset to write at the end, such as uavrl/fixed-v0"""
+    tensorboard: bool = False
+    """write the log for TensorBoard as well; needs the extra 'tracking'"""
 
     def run(self) -> None:
         from uavrl.agents.sac import SacConfig
         from uavrl.datasets import save_flat, write_minari
         from uavrl.networks import NetworkConfig
-        from uavrl.training.log import progress
+        from uavrl.training.log import progress, require_tensorboard
         from uavrl.training.online import CollectConfig, OnlineLearner, same_run
 
+        if self.tensorboard:
+            require_tensorboard()
         width = 256 if self.network == "mlp" else 64
         agent = SacConfig(network=NetworkConfig(kind=self.network, width=width))
         config = pydantic_config(
@@ -63,8 +67,13 @@ class Collect:
         else:
             print(f"going on from step {len(learner.log):,}", file=sys.stderr)
         limit = config.scenario.limits.max_steps or 0
-        with progress("collect", config.episodes * limit, "step") as report:
-            transitions = learner.run(self.out, report)
+        try:
+            with progress("collect", config.episodes * limit, "step") as report:
+                transitions = learner.run(self.out, report, tensorboard=self.tensorboard)
+        except KeyboardInterrupt:
+            if learner.saved is not None:
+                print(f"saved step {learner.saved:,}; the same command goes on", file=sys.stderr)
+            raise
         save_flat(self.out / "flights.parquet", transitions, config.scenario)
         print(f"{self.out / 'flights.parquet'}: {transitions!r}")
         if self.minari is not None:

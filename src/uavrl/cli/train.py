@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 Many = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
+LOG_EVERY = 200  # updates between rows of the log, at most
 TRIAL_SEED = 500_000  # trial flights during training: neither the data's seeds nor the evaluation's
 
 
@@ -32,7 +33,7 @@ class Train:
     ]
     """algorithm"""
     out: Path
-    """directory of the run: checkpoint and metrics.jsonl"""
+    """directory of the run: checkpoint, metrics.jsonl and, where asked for, tensorboard"""
     data: str = "layouts"
     """layouts or fixed (built in), or a .parquet or .npz file, or the id of a Minari dataset"""
     size: int | None = None
@@ -57,25 +58,33 @@ class Train:
     """updates between trial flights on 20 layouts of their own; 0: none"""
     resume: bool = False
     """go on from the checkpoint in --out"""
+    tensorboard: bool = False
+    """write the log for TensorBoard as well; needs the extra 'tracking'"""
 
     def run(self) -> None:
         from uavrl.agents.registry import preset
         from uavrl.datasets import load_source, select
-        from uavrl.training.log import progress
+        from uavrl.training.checkpoint import recover
+        from uavrl.training.health import summary
+        from uavrl.training.log import progress, read_metrics, require_tensorboard
         from uavrl.training.offline import PRESET_UPDATES, OfflineLearner, TrainConfig
 
+        if self.tensorboard:
+            require_tensorboard()  # before anything that takes long
         transitions, scenario = load_source(self.data, self.scenario)
         size = self.size if self.size is not None else (30_000 if self.data in ("fixed", "layouts") else None)
         if size is not None:
             transitions = select(transitions, size, self.quality, self.data_seed)
         elif self.quality != "mixed":
             raise ConfigError(f"--quality {self.quality} needs --size")
+        updates = PRESET_UPDATES[self.preset] if self.updates is None else self.updates
         config = pydantic_config(
             TrainConfig,
             scenario=scenario,
             agent=with_settings(preset(self.agent, self.preset), self.set),
-            updates=PRESET_UPDATES[self.preset] if self.updates is None else self.updates,
+            updates=updates,
             seed=self.seed,
+            log_every=min(LOG_EVERY, max(1, updates // 50)),  # enough rows to judge a short run by
             evaluate_every=self.evaluate_every,
         )
         output_directory(self.out)
@@ -83,7 +92,7 @@ class Train:
         if self.resume and learner is None:
             raise ConfigError(f"--resume: '{self.out}' holds no checkpoint")
         if learner is None:
-            if (self.out / "checkpoint").exists():
+            if recover(self.out / "checkpoint") is not None:
                 raise ConfigError(f"--out '{self.out}' holds a run already; give --resume or another directory")
             learner = OfflineLearner(config, transitions, self.device)
         elif learner.config != config:
@@ -91,8 +100,14 @@ class Train:
         else:
             print(f"going on from update {learner.updates:,}", file=sys.stderr)
         trial = trial_flights(transitions, scenario) if self.evaluate_every else None
-        with progress(f"train {self.agent}", config.updates, "update") as report:
-            learner.run(self.out, report, trial)
+        try:
+            with progress(f"train {self.agent}", config.updates, "update") as report:
+                learner.run(self.out, report, trial, tensorboard=self.tensorboard)
+        except KeyboardInterrupt:
+            if learner.saved is not None:
+                print(f"saved update {learner.saved:,}; the same command with --resume goes on", file=sys.stderr)
+            raise
+        print(summary(read_metrics(self.out / "metrics.jsonl"), learner.expected))
         print(f"{learner.updates:,} updates on {len(transitions):,} transitions; policy in {self.out}")
         print(f"next: uavrl evaluate --policy tdm --policy {self.out} --scenario {scenario.name}")
 

@@ -1,4 +1,4 @@
-"""Run logs: one JSON object a line, and progress on the terminal."""
+"""Run logs: one JSON object a line, TensorBoard beside it where asked for, and progress on the terminal."""
 
 from __future__ import annotations
 
@@ -14,12 +14,25 @@ from typing import Any, Protocol, TextIO
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from uavrl.errors import ConfigError
+
 
 class MetricsLog:
-    """Appends rows to a JSONL file; a number that is not finite is written as null."""
+    """Appends rows to a JSONL file; a number that is not finite is written as null.
 
-    def __init__(self, path: Path) -> None:
-        self.path = Path(path)
+    Args:
+        path: of the file.
+        board: folder for TensorBoard's event files; none are written without.
+
+    Raises:
+        ConfigError: `board` is given and TensorBoard is not installed.
+    """
+
+    def __init__(self, path: Path, board: Path | None = None) -> None:
+        self.path, self.board = Path(path), board
+        self.writer: Any = None
+        if board is not None:
+            require_tensorboard()
         self.path.parent.mkdir(parents=True, exist_ok=True)
 
     def write(self, row: Mapping[str, Any]) -> None:
@@ -29,13 +42,52 @@ class MetricsLog:
         }
         with self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(clean) + "\n")
+        if self.board is not None:
+            step = int(row["step"])
+            if self.writer is None:
+                self.writer = require_tensorboard()(str(self.board), purge_step=step)
+            for key, value in clean.items():
+                if key != "step" and isinstance(value, int | float):
+                    self.writer.add_scalar(key, value, step)
 
     def cut(self, step: int) -> None:
         """Drop rows after `step`: what a run wrote beyond the checkpoint that it resumes from."""
         if self.path.exists():
-            lines = self.path.read_text(encoding="utf-8").splitlines()
-            kept = [line for line in lines if line.endswith("}") and json.loads(line).get("step", 0) <= step]
-            self.path.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
+            kept = [row for row in read_metrics(self.path) if row.get("step", 0) <= step]
+            aside = self.path.with_name(f".{self.path.name}.tmp")
+            aside.write_text("".join(json.dumps(row) + "\n" for row in kept), encoding="utf-8")
+            aside.replace(self.path)  # a process killed in between loses no row
+
+    def close(self) -> None:
+        """Write out what TensorBoard still holds back."""
+        if self.writer is not None:
+            self.writer.close()
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """Rows of a log, but for a line whose writer was killed within it."""
+    rows = []
+    for line in Path(path).read_text(encoding="utf-8").splitlines():
+        try:
+            rows.append(json.loads(line))
+        except ValueError:
+            continue
+    return rows
+
+
+def require_tensorboard() -> Any:
+    """Its writer's class.
+
+    Raises:
+        ConfigError: not installed.
+    """
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        raise ConfigError(
+            "tensorboard = true needs the extra 'tracking', which is not installed: pip install 'uavrl[tracking]'"
+        ) from None
+    return SummaryWriter
 
 
 class Reporter(Protocol):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal
@@ -14,17 +15,25 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from uavrl.actions import HybridAction
 from uavrl.agents.base import Batch
+from uavrl.agents.bc import BcConfig
+from uavrl.agents.diffusion_sac import DiffusionSacConfig
+from uavrl.agents.gaussian_bc import GaussianBcConfig
 from uavrl.agents.registry import OfflineConfig, make_agent
 from uavrl.datasets.transitions import Transitions
 from uavrl.errors import CheckpointError, ConfigError, DivergenceError
 from uavrl.evaluation.rollouts import EVALUATION_SEED
-from uavrl.networks import Observation, fit_normalisers
+from uavrl.networks import fit_normalisers
 from uavrl.scenario import Scenario
 from uavrl.training.batches import OBSERVATION_OF, reward_transform, spaces_of, to_batch, transformed
 from uavrl.training.checkpoint import agent_tensors, load_checkpoint, recover, restore_agent, save_checkpoint
+from uavrl.training.fit import learn_once, take
+from uavrl.training.health import Expected
 from uavrl.training.interrupts import held_interrupts
 from uavrl.training.log import MetricsLog, Reporter
 from uavrl.training.policy import AgentPolicy
+from uavrl.training.support import Support
+
+__all__ = ["PRESET_UPDATES", "Evaluator", "OfflineLearner", "TrainConfig", "take"]
 
 Evaluator = Callable[[AgentPolicy], dict[str, float]]
 
@@ -46,24 +55,6 @@ class TrainConfig(BaseModel):
     evaluate_every: int = Field(0, ge=0, description="updates between trial flights; 0: none")
 
 
-def _index(observation: Observation, rows: torch.Tensor) -> Observation:
-    if isinstance(observation, dict):
-        return {key: value.index_select(0, rows) for key, value in observation.items()}
-    return observation.index_select(0, rows)
-
-
-def take(data: Batch, rows: torch.Tensor) -> Batch:
-    """Rows of a batch."""
-    return Batch(
-        observation=_index(data.observation, rows),
-        action=HybridAction(data.action.continuous.index_select(0, rows), data.action.choice.index_select(0, rows)),
-        reward=data.reward.index_select(0, rows),
-        duration_s=data.duration_s.index_select(0, rows),
-        terminated=data.terminated.index_select(0, rows),
-        next_observation=_index(data.next_observation, rows),
-    )
-
-
 def _to(data: Batch, device: torch.device) -> Batch:
     def move(value: Any) -> Any:
         if isinstance(value, dict):
@@ -77,6 +68,8 @@ def _to(data: Batch, device: torch.device) -> Batch:
 
 class OfflineLearner:
     """An agent, its data as tensors, and the generator of data order and noise.
+
+    Logging draws from generators of its own, so how often it happens changes nothing of what is learned.
 
     Raises:
         ConfigError: data of another number of devices than the scenario, or no such device.
@@ -107,14 +100,32 @@ class OfflineLearner:
         self.generator = torch.Generator(self.device).manual_seed(config.seed)
         self.digest = transitions.digest()
         self.updates = 0
-        # |Q| of transformed rewards cannot exceed this; ten times beyond it nothing is learned any more
-        largest = float(data.reward.abs().max())
-        per = (
-            config.agent.discount
-            if config.agent.discount_per == "step"
-            else config.agent.discount ** float(data.duration_s.mean())
+        self.saved: int | None = None  # the update of the last checkpoint
+        self.support: Support | None = None  # made when first asked: it takes a moment
+        self.expected = self._expected()
+        # ten times beyond what is possible nothing is learned any more
+        self.q_limit = 10.0 * max(1.0 / (1.0 - self._discount()), -self.expected.q[0], self.expected.q[1])
+
+    def _discount(self) -> float:
+        """The largest of any transition."""
+        agent = self.config.agent
+        return agent.discount if agent.discount_per == "step" else agent.discount ** float(self.data.duration_s.min())
+
+    def _expected(self) -> Expected:
+        """What the settings and the data allow of the log's numbers."""
+        agent, reward, spaces = self.config.agent, self.data.reward, self.agent.spaces
+        cloning = None
+        if isinstance(agent, BcConfig) or (isinstance(agent, DiffusionSacConfig) and agent.bc_weight > 0):
+            cloning = 1.0  # the squared error of a denoiser that answers 0 to unit noise
+        elif isinstance(agent, GaussianBcConfig):
+            cloning = spaces.continuous * math.log(2.0) + math.log(spaces.choices)  # a uniform guess
+        horizon = 1.0 / (1.0 - self._discount())
+        return Expected(
+            q=(min(float(reward.min()), 0.0) * horizon, max(float(reward.max()), 0.0) * horizon),
+            reward_deviation=float(reward.std(correction=0)),
+            bc_loss=cloning,
+            gradient_clip=agent.gradient_clip,
         )
-        self.q_limit = 10.0 * max(largest, 1.0) / (1.0 - per)
 
     def _rate(self) -> float:
         base = self.config.agent.learning_rate
@@ -128,56 +139,75 @@ class OfflineLearner:
         for optimiser in self.agent.optimisers.values():
             for group in optimiser.param_groups:
                 group["lr"] = rate
-        count = len(self.data.reward)
-        shape = (self.config.agent.batch_size,)
-        rows = torch.randint(0, count, shape, generator=self.generator, device=self.device)
-        metrics = self.agent.update(take(self.data, rows), self.generator)
+        metrics = learn_once(self.agent, self.data, self.generator)
         self.updates += 1
         return metrics
 
-    def run(self, directory: Path, report: Reporter, evaluate: Evaluator | None = None) -> AgentPolicy:
+    def support_distance(self) -> float:
+        """How far the policy acts from the logged actions, see `Support`; the same rows and noise each time."""
+        if self.support is None:
+            self.support = Support(self.data, seed=self.config.seed)
+        generator = torch.Generator(self.device).manual_seed(self.config.seed)
+        return float(self.support.distance(self.agent, generator))
+
+    def run(
+        self, directory: Path, report: Reporter, evaluate: Evaluator | None = None, *, tensorboard: bool = False
+    ) -> AgentPolicy:
         """Update until the end, with checkpoints, metrics and trial flights; saves on interrupt.
 
         Raises:
+            ConfigError: `tensorboard`, which is not installed.
             DivergenceError: a metric is not finite, or Q beyond any possible return; the last checkpoint stays.
         """
-        log = MetricsLog(directory / "metrics.jsonl")
-        log.cut(self.updates)
         policy = AgentPolicy(self.config.agent.name, self.agent, self.config.scenario)
         config, text = self.config, ""
-        with held_interrupts() as interrupted:
+        board = directory / "tensorboard" if tensorboard else None
+        with closing(MetricsLog(directory / "metrics.jsonl", board)) as log, held_interrupts() as interrupted:
+            log.cut(self.updates)
             while self.updates < config.updates:
                 metrics = self.step()
                 stop = interrupted()
                 logs = self.updates % config.log_every == 0 or self.updates == config.updates
                 saves = self.updates % config.save_every == 0 or stop
-                if logs or saves:  # nothing is saved that has not been looked at
+                tries = evaluate is not None and config.evaluate_every and self.updates % config.evaluate_every == 0
+                if logs or saves or tries:  # nothing is saved or flown that has not been looked at
                     row = {name: float(value) for name, value in metrics.items()}
-                    self._check(row)
+                    self._check(row, directory)
                 if logs:
+                    row["support_distance"] = self.support_distance()
                     log.write({"step": self.updates} | row)
                     shown = ("q", "critic_loss", "bc_loss")
                     text = ", ".join(f"{name} {row[name]:.3g}" for name in shown if name in row)
-                if evaluate and config.evaluate_every and self.updates % config.evaluate_every == 0:
-                    flown = evaluate(policy)
-                    log.write({"step": self.updates} | flown)
+                if evaluate is not None and tries:
+                    log.write({"step": self.updates} | evaluate(policy))
                 if saves:
                     self.save(directory)
                 if stop:
                     raise KeyboardInterrupt
                 report(self.updates, text)
-        self.save(directory)
+        if self.saved != self.updates:
+            self.save(directory)
         return policy
 
-    def _check(self, row: dict[str, float]) -> None:
+    def _check(self, row: dict[str, float], directory: Path) -> None:
         for name, value in row.items():
             if not math.isfinite(value):
-                raise DivergenceError(f"training diverged: {name} = {value} after {self.updates} updates")
+                raise self._diverged(f"{name} = {value}", directory)
+        for name, tensor in self.agent.networks.state_dict().items():
+            if tensor.is_floating_point() and not tensor.isfinite().all():
+                raise self._diverged(f"weights {name} are not finite", directory)
         if abs(row.get("q", 0.0)) > self.q_limit:
-            raise DivergenceError(
-                f"training diverged: q = {row['q']:.3g} after {self.updates} updates, allowed: +-{self.q_limit:.3g}; "
-                "try a smaller learning_rate or a larger bc_weight"
-            )
+            raise self._diverged(f"q = {row['q']:.3g}, allowed: +-{self.q_limit:.3g}", directory)
+
+    def _diverged(self, what: str, directory: Path) -> DivergenceError:
+        kept = "no checkpoint had been saved"
+        if self.saved is not None:
+            kept = f"'{directory / 'checkpoint'}' keeps update {self.saved}, the last good one"
+        weight = " or a larger bc_weight" if hasattr(self.config.agent, "bc_weight") else ""
+        return DivergenceError(
+            f"training diverged: {what} after {self.updates} updates; {kept}; "
+            f"try another run with a smaller learning_rate{weight}"
+        )
 
     def save(self, directory: Path) -> None:
         """Everything that `resume` needs, into directory/checkpoint."""
@@ -194,6 +224,7 @@ class OfflineLearner:
         }
         tensors = agent_tensors(self.agent) | {"loop": {"generator": self.generator.get_state()}}
         save_checkpoint(directory / "checkpoint", document, tensors)
+        self.saved = self.updates
 
     @classmethod
     def resume(cls, directory: Path, transitions: Transitions, device: str = "cpu") -> OfflineLearner | None:
@@ -220,5 +251,5 @@ class OfflineLearner:
             raise CheckpointError(f"checkpoint '{path}' was trained on other data; give the same --data")
         restore_agent(learner.agent, checkpoint.tensors)
         learner.generator.set_state(checkpoint.tensors["loop"]["generator"])
-        learner.updates = checkpoint.document["step"]
+        learner.updates = learner.saved = checkpoint.document["step"]
         return learner

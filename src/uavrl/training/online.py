@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -90,6 +91,7 @@ class OnlineLearner:
         self.ended = np.zeros(config.environments, dtype=bool)
         self.finished = 0
         self.updates = 0
+        self.saved: int | None = None  # the step of the last checkpoint
         self.centre = 0.0
 
     def _act(self) -> FlightAction:
@@ -151,22 +153,28 @@ class OnlineLearner:
         metrics = self.agent.update(batch, self.generator)
         for name in ("critic_loss", "actor_loss"):  # each time: the next action of a policy of NaN cannot be drawn
             if not metrics[name].isfinite():
+                kept = "no checkpoint had been saved"
+                if self.saved is not None:
+                    kept = f"the checkpoint keeps step {self.saved}, the last good one"
                 raise DivergenceError(
-                    f"training diverged: {name} = {float(metrics[name])} after {self.updates} updates"
+                    f"training diverged: {name} = {float(metrics[name])} after {self.updates} updates; {kept}; "
+                    "try another run with a smaller learning_rate"
                 )
         return metrics
 
-    def run(self, directory: Path, report: Reporter, save_every: int = 20_000) -> Transitions:
+    def run(
+        self, directory: Path, report: Reporter, save_every: int = 20_000, *, tensorboard: bool = False
+    ) -> Transitions:
         """Fly and learn until all episodes are logged; checkpoints every `save_every` steps and on interrupt.
 
         Raises:
+            ConfigError: `tensorboard`, which is not installed.
             DivergenceError: a loss is not finite; the last checkpoint stays.
         """
-        log = MetricsLog(directory / "metrics.jsonl")
-        log.cut(len(self.log))
         recent: list[float] = []
-        saved = len(self.log)
-        with held_interrupts() as interrupted:
+        board = directory / "tensorboard" if tensorboard else None
+        with closing(MetricsLog(directory / "metrics.jsonl", board)) as log, held_interrupts() as interrupted:
+            log.cut(len(self.log))
             while self.finished < self.config.episodes:
                 for value in self._fly():
                     recent = [*recent[-19:], value]
@@ -180,9 +188,8 @@ class OnlineLearner:
                 mean = f", return {np.mean(recent):.0f} (last {len(recent)})" if recent else ""
                 report(len(self.log), f"episode {self.finished}{mean}")
                 stop = interrupted()
-                if stop or len(self.log) - saved >= save_every:
+                if stop or len(self.log) - (self.saved or 0) >= save_every:
                     self.save(directory)
-                    saved = len(self.log)
                 if stop:
                     raise KeyboardInterrupt
         self.save(directory)
@@ -217,6 +224,7 @@ class OnlineLearner:
         rows = {name: torch.from_numpy(value) for name, value in self.log.state_dict().items()}
         tensors = agent_tensors(self.agent) | {"loop": state | loop, "log": rows}
         save_checkpoint(directory / "checkpoint", document, tensors)
+        self.saved = len(self.log)
 
     @classmethod
     def resume(cls, directory: Path) -> OnlineLearner | None:
@@ -249,7 +257,7 @@ class OnlineLearner:
         learner.generator.set_state(tensors["loop"]["generator"])
         learner.episode, learner.returns, learner.ended = loop["episode"], loop["returns"], loop["ended"]
         learner.finished, learner.updates = document["finished"], document["updates"]
-        learner.centre = document["centre"]
+        learner.centre, learner.saved = document["centre"], len(learner.log)
         learner.observation = learner.environment.observation()
         return learner
 
