@@ -17,6 +17,8 @@ from tests.agents.problems import DEVICES, KINDS, Kind, agent, batch, copies, di
 from tests.agents.test_known_values import GAMMA, chain_batch
 from tests.agents.test_losses import Array, discount_of, q_of, row
 from uavrl.actions import HybridAction
+from uavrl.agents import cql as cql_module
+from uavrl.agents import diffusion_sac as diffusion_sac_module
 from uavrl.agents.base import Agent, Batch
 from uavrl.agents.bcq import Bcq, BcqConfig, candidate_choices, soft_minimum
 from uavrl.agents.cql import Cql, CqlConfig, PenaltyNoise, conservative_penalty, proposals
@@ -153,6 +155,30 @@ def test_critic_loss_of_cql(kind: Kind, soft: bool, weight: float) -> None:
     assert ("cql_penalty" in metrics) == (weight > 0)
     penalty = float(metrics["cql_penalty"]) if weight else 0.0
     assert float(loss.detach()) == pytest.approx(expected + weight * penalty, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["cql", "diffusion_sac"])
+def test_uniform_displacements_of_an_update_fill_the_box(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of [-1, 1] in each entry, as their density 2^-C says; and what CQL draws beside them is standard normal."""
+    seen: list[Tensor] = []
+    module = {"cql": cql_module, "diffusion_sac": diffusion_sac_module}[name]
+
+    def watched(critic: Any, context: Any, w: Tensor, q_data: Tensor, *rest: Any) -> Tensor:
+        seen.append(w)
+        return conservative_penalty(critic, context, w, q_data, *rest)
+
+    monkeypatch.setattr(module, "conservative_penalty", watched)
+    agent(name, "mlp", cql_weight=1.0, cql_samples=20).update(batch("mlp", 200), torch.Generator().manual_seed(0))
+    (w,) = seen
+    w = w.view(200, -1, 2)[:, :20].reshape(-1, 2)
+    assert w.abs().max() <= 1.0
+    torch.testing.assert_close(w.mean(dim=0), torch.zeros(2), rtol=0, atol=0.03)
+    torch.testing.assert_close(w.var(dim=0), torch.full((2,), 1 / 3), rtol=0, atol=0.02)
+    drawn = PenaltyNoise.draw(200, 20, 2, torch.Generator().manual_seed(0))
+    for normal in (drawn.here, drawn.after):
+        assert float(normal.mean()) == pytest.approx(0.0, abs=0.05)
+        assert float(normal.std()) == pytest.approx(1.0, abs=0.05)
+    assert not torch.equal(drawn.here, drawn.after)
 
 
 def test_a_penalised_critic_holds_what_is_not_in_the_data_under_what_is() -> None:
@@ -580,7 +606,7 @@ def test_hybrid_bandit_finds_the_best_choice_and_its_own_displacement(name: str,
     reward = reward - reward.median()
     shared: dict[str, Any] = {"network": NetworkConfig(kind="mlp", width=64, depth=2), "batch_size": 128, "huber": None}
     configs = {
-        "cql": CqlConfig(**shared, continuous_entropy=-4.0, choice_entropy=0.02),
+        "cql": CqlConfig(**shared, continuous_entropy=-4.0, choice_entropy=0.02, cql_samples=4),
         # its policy is the data's times min(e^(beta A), 100): V close to the best Q, for 100 not to be met there, and
         # beta 8, for the second best, .5 behind, to have e^-4 of the best's weight; at beta 3 it has a quarter
         "iql": IqlConfig(**shared, expectile=0.98, inverse_temperature=8.0),
@@ -595,7 +621,7 @@ def test_hybrid_bandit_finds_the_best_choice_and_its_own_displacement(name: str,
         return Batch(state, HybridAction(w[rows], d[rows]), reward[rows], one, one, state)
 
     learn(made, draw, 2_000, seed)
-    action = made.act(torch.zeros(2_000, 1), generator=torch.Generator().manual_seed(9))
+    action = made.act(torch.zeros(500, 1), generator=torch.Generator().manual_seed(9))
     best = int(worth.argmax())
     right = (action.choice == best).float().mean()
     near = ((action.continuous - modes[best]).norm(dim=1) < 0.2).float().mean()

@@ -27,8 +27,9 @@ def test_every_agent_is_registered_once_and_under_its_own_name() -> None:
 @pytest.mark.parametrize("name", PRESETS)
 def test_settings_are_read_back_as_those_of_their_agent(name: str) -> None:
     for config in PRESETS[name].values():
-        for union in (OfflineConfig, AnyConfig):
-            assert TypeAdapter[Any](union).validate_python(config.model_dump(mode="json")) == config
+        unions: tuple[Any, ...] = (OfflineConfig, AnyConfig)
+        for union in unions:
+            assert TypeAdapter(union).validate_python(config.model_dump(mode="json")) == config
 
 
 def test_the_command_line_takes_every_agent_by_its_name_and_with_hyphens() -> None:
