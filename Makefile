@@ -15,7 +15,7 @@ DOCUMENTATION := tests/test_documentation.py
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup $(VENV) test test-all check format demo data clean
+.PHONY: help setup $(VENV) test test-all check format demo data peers clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -53,7 +53,7 @@ test-all: $(STAMP)  ## run every test
 check: $(STAMP)  ## lint, format, types, and the code blocks of the documentation
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
-	$(BIN)/mypy src tests $(wildcard examples)
+	$(BIN)/mypy src tests benchmarks $(wildcard examples)
 	$(BIN)/python -m pytest --quiet $(DOCUMENTATION)
 
 format: $(STAMP)  ## mend what ruff can mend
@@ -75,6 +75,20 @@ data: $(STAMP)  ## collect the built-in data anew, with its good and bad parts, 
 	done
 	@echo "to ship them: cp runs/fixed-mixed.parquet src/uavrl/datasets/builtin/fixed.parquet, and layouts likewise"
 
-clean:  ## remove .venv, caches and builds
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
+# d3rlpy pins an older gymnasium, so it has an environment of its own; arrays on disk are all that passes between them.
+PEERS := .venv-peers
+peers: export OMP_NUM_THREADS := 1
+peers: $(STAMP) $(PEERS)/.installed  ## cross-check CQL and IQL against d3rlpy, into runs/peers/ (minutes)
+	rm -f runs/peers/*.npz
+	$(BIN)/python -m benchmarks.peers.ours runs/peers
+	$(PEERS)/bin/python -m benchmarks.peers.theirs runs/peers
+	$(BIN)/python -m benchmarks.peers.table runs/peers
+
+$(PEERS)/.installed: benchmarks/peers/constraints.txt
+	test -x $(PEERS)/bin/python || $(PYTHON) -m venv $(PEERS)
+	$(PEERS)/bin/python -m pip install --quiet --constraint benchmarks/peers/constraints.txt $(PIP_FLAGS) d3rlpy
+	@touch $@
+
+clean:  ## remove .venv, .venv-peers, caches and builds
+	rm -rf $(VENV) $(PEERS) .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
