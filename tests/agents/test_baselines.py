@@ -242,6 +242,10 @@ def test_samples_have_the_policys_frequencies_means_and_deviations() -> None:
         assert len(of_d) / many == pytest.approx(float(p[d]), abs=0.02)
         torch.testing.assert_close(of_d.mean(dim=0), output.mean[0, d], rtol=0, atol=0.03)
         torch.testing.assert_close(of_d.std(dim=0), output.log_std[0, d].exp(), rtol=0.1, atol=0.01)
+    wide = ChoiceActorOutput(output.mean, torch.ones_like(output.log_std), output.logits)
+    clipped = gaussian_action(Given(wide), torch.zeros(100, 1), torch.Generator().manual_seed(0), False).continuous
+    assert float(clipped.min()) == -1.0
+    assert float(clipped.max()) == 1.0
     likeliest = gaussian_action(Given(output), torch.zeros(3, 1), torch.Generator(), True)
     assert (likeliest.choice == p.argmax()).all()
     torch.testing.assert_close(likeliest.continuous, output.mean[0, p.argmax()].expand(3, 2))
