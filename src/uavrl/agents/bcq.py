@@ -64,7 +64,7 @@ class BcqConfig(AgentConfig):
     target_candidates: int = Field(
         10, ge=1, description="candidates at s'. They go round the allowed choices, the likeliest first"
     )
-    candidates: int = Field(100, ge=1, description="candidates at a decision")
+    candidates: int = Field(50, ge=1, description="candidates at a decision; their cost is its cost")
 
 
 class Bcq(Agent):
