@@ -14,6 +14,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from safetensors.torch import save_file
 
 from uavrl.errors import CheckpointError
 from uavrl.training import checkpoint as module
@@ -140,8 +141,8 @@ def kill(patch: pytest.MonkeyPatch, operation: int, share: float) -> None:
             file.unlink()
 
     write_text = Path.write_text
-    patch.setattr(module.shutil, "rmtree", instead(shutil.rmtree, some))
-    patch.setattr(module, "save_file", instead(module.save_file, cut))
+    patch.setattr(shutil, "rmtree", instead(shutil.rmtree, some))
+    patch.setattr(module, "save_file", instead(save_file, cut))
     patch.setattr(module, "_sync", instead(lambda path: None, whole_or_not))
     patch.setattr(Path, "write_text", instead(write_text, cut))
     patch.setattr(Path, "mkdir", instead(Path.mkdir, whole_or_not))

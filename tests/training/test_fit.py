@@ -3,6 +3,7 @@ from __future__ import annotations
 import torch
 
 from tests.agents.problems import agent, batch, copies, equal
+from uavrl.agents.base import Batch, Metrics
 from uavrl.training.fit import fit, learn_once, take
 
 
@@ -34,7 +35,12 @@ def test_fit_sets_the_normalisers_and_updates_so_many_times_on_minibatches() -> 
 def test_minibatches_come_from_the_generator_and_reach_every_row() -> None:
     data, made = batch("mlp", 12), agent("bc", "mlp", batch_size=6)
     seen: list[torch.Tensor] = []
-    made.update = lambda drawn, noise: seen.append(drawn.reward) or {}  # type: ignore[method-assign,func-returns-value]  # a spy
+
+    def update(batch: Batch, generator: torch.Generator) -> Metrics:
+        seen.append(batch.reward)
+        return {}
+
+    made.update = update  # type: ignore[method-assign]  # a spy
     noise = generator(1)
     for _ in range(20):
         learn_once(made, data, noise)

@@ -178,8 +178,13 @@ def test_divergence_stops_the_run_and_the_last_good_checkpoint_stays(
 @pytest.mark.parametrize("due", ["log_every", "save_every", "evaluate_every"])
 def test_weights_that_are_not_finite_are_neither_saved_nor_flown(tmp_path: Path, flown: Transitions, due: str) -> None:
     """Though every metric of that update, taken before its step, is fine."""
-    learner = OfflineLearner(config("bc", **{"log_every": 100, "save_every": 100, "updates": 30} | {due: 3}), flown)
-    real, tried = learner.agent.update, []
+    changes: dict[str, Any] = {"log_every": 100, "save_every": 100, "updates": 30, due: 3}
+    learner = OfflineLearner(config("bc", **changes), flown)
+    real, tried = learner.agent.update, list[AgentPolicy]()
+
+    def evaluate(policy: AgentPolicy) -> dict[str, float]:
+        tried.append(policy)
+        return {"return": -1.0}
 
     def update(*arguments: Any) -> dict[str, torch.Tensor]:
         metrics = real(*arguments)
@@ -191,7 +196,7 @@ def test_weights_that_are_not_finite_are_neither_saved_nor_flown(tmp_path: Path,
     with pytest.raises(
         DivergenceError, match=r"weights actor\..* are not finite after 3 updates; no checkpoint had been"
     ):
-        learner.run(tmp_path, quiet, lambda policy: tried.append(policy) or {})  # type: ignore[func-returns-value]
+        learner.run(tmp_path, quiet, evaluate)
     assert not (tmp_path / "checkpoint").exists()
     assert tried == []
 
