@@ -81,6 +81,8 @@ peers: export OMP_NUM_THREADS := 1
 peers: $(STAMP) $(PEERS)/.installed  ## cross-check CQL and IQL against d3rlpy, into runs/peers/ (minutes)
 	rm -f runs/peers/*.npz
 	$(BIN)/python -m benchmarks.peers.ours runs/peers
+	$(BIN)/python -m benchmarks.peers.losses_ours runs/peers
+	$(PEERS)/bin/python -m benchmarks.peers.losses_theirs runs/peers
 	$(PEERS)/bin/python -m benchmarks.peers.theirs runs/peers
 	$(BIN)/python -m benchmarks.peers.table runs/peers
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from torch import Tensor
 from benchmarks.peers import point_mass, settings
 from benchmarks.peers.point_mass import Array, Flights, Policy
 from uavrl.actions import HybridAction
-from uavrl.agents.base import AgentConfig, Batch, RewardConfig
+from uavrl.agents.base import Batch, RewardConfig
 from uavrl.agents.cql import CqlConfig
 from uavrl.agents.iql import IqlConfig
 from uavrl.agents.registry import make_agent
@@ -37,34 +38,43 @@ def best_controller() -> Policy:
     return act
 
 
-def agent_config(name: str) -> CqlConfig | IqlConfig:
-    """The shared settings in our names; what d3rlpy lacks, off. Our Bellman error counts half; so does the penalty."""
-    shared = AgentConfig(
-        network=NetworkConfig(
-            kind="mlp", width=settings.WIDTH, depth=settings.DEPTH, activation="relu", log_inputs=False
-        ),
-        reward=RewardConfig(transform="none", clip=None),
-        batch_size=settings.BATCH,
-        learning_rate=settings.LEARNING_RATE,
-        discount=settings.DISCOUNT,
-        polyak=settings.POLYAK,
-        huber=None,
-        gradient_clip=None,
-    ).model_dump()
-    if name == "cql":
-        return CqlConfig(
-            **shared,
-            cql_weight=settings.CQL_WEIGHT / 2,
-            cql_samples=settings.CQL_SAMPLES,
-            continuous_entropy=-point_mass.ACTION,
-            initial_temperature=settings.INITIAL_TEMPERATURE,
-        )
+def _shared() -> dict[str, Any]:
+    """The shared settings in our names; what d3rlpy lacks is off."""
+    network = NetworkConfig(kind="mlp", width=settings.WIDTH, depth=settings.DEPTH, activation="relu", log_inputs=False)
+    return {
+        "network": network,
+        "reward": RewardConfig(transform="none", clip=None),
+        "batch_size": settings.BATCH,
+        "learning_rate": settings.LEARNING_RATE,
+        "discount": settings.DISCOUNT,
+        "polyak": settings.POLYAK,
+        "huber": None,
+        "gradient_clip": None,
+    }
+
+
+def cql_config() -> CqlConfig:
+    """Our Bellman error counts half; so does the penalty."""
+    return CqlConfig(
+        **_shared(),
+        cql_weight=settings.CQL_WEIGHT / 2,
+        cql_samples=settings.CQL_SAMPLES,
+        continuous_entropy=-point_mass.ACTION,
+        initial_temperature=settings.INITIAL_TEMPERATURE,
+    )
+
+
+def iql_config() -> IqlConfig:
+    """All of it has the same meaning on both sides."""
     return IqlConfig(
-        **shared,
+        **_shared(),
         expectile=settings.EXPECTILE,
         inverse_temperature=settings.INVERSE_TEMPERATURE,
         weight_limit=settings.WEIGHT_LIMIT,
     )
+
+
+CONFIGS = {"cql": cql_config, "iql": iql_config}
 
 
 def batch(data: dict[str, Tensor], rows: Tensor) -> Batch:
@@ -79,7 +89,7 @@ def batch(data: dict[str, Tensor], rows: Tensor) -> Batch:
 def learn(name: str, data: Flights, seed: int, updates: int) -> Policy:
     """The agent's policy, deterministic."""
     torch.manual_seed(seed)
-    agent = make_agent(SPACES, agent_config(name))
+    agent = make_agent(SPACES, CONFIGS[name]())
     generator = torch.Generator().manual_seed(seed)
     log = {key: torch.as_tensor(array, dtype=torch.float32) for key, array in point_mass.transitions(data).items()}
     for _ in range(updates):

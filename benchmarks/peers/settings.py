@@ -16,6 +16,9 @@ TRIAL_EPISODES = 200
 TRIAL_SEED = 1_000_000
 SEEDS = (0, 1, 2)
 DATA = "data.npz"
+LOSSES = "losses.npz"
+PENALTY_SAMPLES = 20_000  # of each kind where losses are compared
+WIDE_LOG_STD = 0.5  # of CQL's policy there: importance weights of a narrow one have no finite variance
 
 WIDTH = 64
 DEPTH = 2

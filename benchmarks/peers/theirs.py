@@ -16,7 +16,7 @@ from benchmarks.peers import settings
 from benchmarks.peers.point_mass import Array, Flights, Policy, cut_episodes
 
 
-def _config(name: str) -> d3rlpy.algos.CQLConfig | d3rlpy.algos.IQLConfig:
+def config(name: str) -> d3rlpy.algos.CQLConfig | d3rlpy.algos.IQLConfig:
     """Nothing learns its weight: alpha's rate of 0 leaves out the Lagrange threshold."""
     encoder = VectorEncoderFactory([settings.WIDTH] * settings.DEPTH)
     shared = {
@@ -54,7 +54,7 @@ def learn(name: str, data: Flights, seed: int, updates: int) -> Policy:
     buffer = ReplayBuffer(InfiniteBuffer(), episodes=episodes)
     if buffer.transition_count != data.reward.size:
         raise RuntimeError(f"d3rlpy found {buffer.transition_count} transitions of {data.reward.size}")
-    algorithm = _config(name).create(device="cpu:0")
+    algorithm = config(name).create(device="cpu:0")
     algorithm.fit(
         buffer,
         n_steps=updates,

@@ -74,14 +74,13 @@ def test_what_we_learn_from_is_never_terminal_and_unscaled() -> None:
     batch = ours.batch(log, rows)
     assert not batch.terminated.any()
     torch.testing.assert_close(batch.reward, log["reward"][rows])
-    for name in ("cql", "iql"):
-        config = ours.agent_config(name)
+    for config in (ours.cql_config(), ours.iql_config()):
         assert (config.huber, config.gradient_clip, config.discount) == (None, None, settings.DISCOUNT)
 
 
 def test_a_few_updates_already_beat_the_data() -> None:
-    data = point_mass.log(100, 0)
-    policy = ours.learn("cql", data, seed=0, updates=100)
+    data = point_mass.log(settings.EPISODES, settings.DATA_SEED)
+    policy = ours.learn("cql", data, seed=0, updates=300)
     assert point_mass.fly(policy, 50, 1).returns.mean() > data.returns.mean()
 
 
