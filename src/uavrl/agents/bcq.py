@@ -54,7 +54,6 @@ class BcqConfig(AgentConfig):
     name: Literal["bcq"] = "bcq"
     batch_size: int = Field(64, ge=1, description="transitions an update; each costs target_candidates passes")
     learning_rate: float = Field(1e-3, gt=0, description="of Adam")
-    discount: float = Field(0.98, ge=0, lt=1, description="gamma, per step or per second")
     polyak: float = Field(0.03, gt=0, le=1, description="rate of the target critic and the target perturbation")
     threshold: float = Field(0.3, ge=0, lt=1, description="least G / max G of a choice; towards 1, cloning")
     perturbation: float = Field(0.05, ge=0, le=1, description="Phi, farthest from the decoder's displacement")

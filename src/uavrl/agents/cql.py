@@ -53,7 +53,6 @@ class CqlConfig(AgentConfig):
         64, ge=1, description="transitions an update; each costs 3 cql_samples passes of the critic"
     )
     learning_rate: float = Field(1e-3, gt=0, description="of Adam")
-    discount: float = Field(0.98, ge=0, lt=1, description="gamma, per step or per second")
     polyak: float = Field(0.03, gt=0, le=1, description="rate of the target critic")
     cql_weight: float = Field(
         0.5,

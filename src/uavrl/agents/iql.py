@@ -39,7 +39,6 @@ class IqlConfig(AgentConfig):
 
     name: Literal["iql"] = "iql"
     learning_rate: float = Field(1e-3, gt=0, description="of Adam")
-    discount: float = Field(0.98, ge=0, lt=1, description="gamma, per step or per second")
     polyak: float = Field(0.03, gt=0, le=1, description="rate of the target critic")
     expectile: float = Field(0.7, gt=0, lt=1, description="tau: .5 values the data's policy, towards 1 its best action")
     inverse_temperature: float = Field(3.0, ge=0, description="beta: 0 clones the data, more follows the advantage")
