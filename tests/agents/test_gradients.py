@@ -311,7 +311,7 @@ def test_guidance_that_pulls_outwards_for_ever_does_not_ruin_the_predicted_noise
     made = make("mlp", gradient=gradient, q_scale="none", bc_weight=0.5, learning_rate=3e-3)
     data = batch("mlp", ROWS)
 
-    def pull(observation: object, vector: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def pull(observation: object, vector: Tensor, jitter: object = None) -> tuple[Tensor, dict[str, Tensor]]:
         w, z = straight_through_clamp(vector[:, :2]), functional.softmax(2 * vector[:, 2:], dim=1)
         return -(3 * w.sum(dim=1) + 3 * z[:, 1]).mean(), {}
 

@@ -123,7 +123,9 @@ def test_two_dimensional_bandit_of_diffusion_q_learning(name: str) -> None:
             spaces, BcConfig(network=NETWORK, learning_rate=1e-3, diffusion=DiffusionConfig(steps=50))
         )
     else:  # the choice changes nothing, so Q has no spread over it to be scaled by
-        config = DiffusionSacConfig(network=NETWORK, learning_rate=1e-3, q_scale="absolute", huber=None)
+        config = DiffusionSacConfig(
+            network=NETWORK, learning_rate=1e-3, q_scale="absolute", huber=None, action_noise=0.0
+        )
         made = DiffusionSac(spaces, config)
     fit(made, w, choice, reward - reward.median(), 5_000, 0)
     action = sampled(made)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -269,3 +270,69 @@ def test_the_critics_use_the_huber_limit_of_their_settings(name: str) -> None:
         metrics = made.update(batch("mlp", ROWS), torch.Generator().manual_seed(0))
         found.append(float(metrics["critic_loss"]))
     assert found[1] < 0.1 * found[0]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_pinned_level_takes_the_batchs_mean_from_the_target_and_nothing_else(kind: Kind) -> None:
+    """The target is r + gamma (min Q' - its mean): the loss is that of rewards lowered by gamma times the mean."""
+    data = batch(kind, ROWS)
+    data = replace(data, terminated=torch.zeros(ROWS))
+    chain = ChainNoise(noise(5, ROWS, 2 + D), noise(6, 3, ROWS, 2 + D))
+    free, pinned = (
+        diffusion_sac(kind, pinned_level=flag, discount=0.9, huber=None, greedy_choice=True) for flag in (False, True)
+    )
+    for made in (free, pinned):
+        disturb(made.target, 1)
+    loss, metrics = pinned.critic_loss(data, chain, None)
+    with torch.no_grad():
+        context = free.actor.average.encode(data.next_observation)
+        w = free.actor.sample(free.actor.average, context, chain)[:, :2].clamp(-1, 1)
+        level = free.target.all_choices(free.target.encode(data.next_observation), w).amin(dim=0).amax(dim=1).mean()
+    lowered = replace(data, reward=data.reward - 0.9 * level)
+    torch.testing.assert_close(loss, free.critic_loss(lowered, chain, None)[0])
+    assert float(metrics["target_q"]) == pytest.approx(float(data.reward.mean()), abs=1e-5)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_action_noise_moves_what_the_critic_is_asked_about(kind: Kind) -> None:
+    """w + sigma eps, held in the box: in the backup, and in L_g where it carries the gradient."""
+    data, chain = batch(kind, ROWS), ChainNoise(noise(5, ROWS, 2 + D), noise(6, 3, ROWS, 2 + D))
+    made = diffusion_sac(kind, action_noise=0.4, greedy_choice=False, discount=0.9, huber=None)
+    disturb(made.target, 1)
+    disturb(made.critic, 2)
+    eps = noise(8, ROWS, 2)
+    with torch.no_grad():
+        vector = made.actor.sample(made.actor.average, made.actor.average.encode(data.next_observation), chain)
+    expected = 0.0
+    for i in range(ROWS):
+        w = (vector[i, :2].clamp(-1, 1) + 0.4 * eps[i]).clamp(-1, 1)
+        value = q_of(made.target, row(data.next_observation, i), w, int(vector[i, 2:].argmax())).min()
+        target = float(data.reward[i]) + discount_of(data, i, "step", 0.9) * value
+        q = q_of(made.critic, row(data.observation, i), data.action.continuous[i], int(data.action.choice[i]))
+        expected += 0.5 * float(((q - target) ** 2).sum()) / ROWS
+    assert float(made.critic_loss(data, chain, None, eps)[0].detach()) == pytest.approx(expected, rel=1e-3)
+
+    asked = noise(9, ROWS, 2 + D).clamp(-0.5, 0.5).requires_grad_()
+    moved = torch.cat([(asked[:, :2] + 0.4 * eps).clamp(-1, 1), asked[:, 2:]], dim=1)
+    loss, plain = made.guidance_loss(data.observation, asked, eps)[0], made.guidance_loss(data.observation, moved)[0]
+    torch.testing.assert_close(loss, plain)
+    torch.testing.assert_close(torch.autograd.grad(loss, asked)[0][:, 2:], torch.autograd.grad(plain, asked)[0][:, 2:])
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.3])
+def test_an_update_draws_action_noise_where_it_is_set(sigma: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, seen = diffusion_sac("mlp", action_noise=sigma), []
+    asked = type(made).guidance_loss
+
+    def guidance_loss(self: object, observation: object, vector: Tensor, jitter: Tensor | None = None) -> object:
+        seen.append(jitter)
+        return asked(self, observation, vector, jitter)  # type: ignore[arg-type]  # passed on as it came
+
+    monkeypatch.setattr(type(made), "guidance_loss", guidance_loss)
+    made.update(batch("mlp", 200), torch.Generator().manual_seed(0))
+    (jitter,) = seen
+    if sigma == 0:
+        assert jitter is None
+    else:
+        assert jitter is not None
+        assert 0.9 < float(jitter.std()) < 1.1

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from uavrl.agents.diffusion_sac import DiffusionSacConfig
+from uavrl.agents.registry import preset
 from uavrl.experiments import ablation
 from uavrl.experiments.ablation import BASE, BASES, CANDIDATES, VARIANTS, changed, measure, runs, summary, table
 from uavrl.experiments.runner import Run
@@ -27,6 +28,10 @@ def test_each_run_changes_what_its_name_says_and_nothing_else(problem: str) -> N
         assert differing <= set(VARIANTS[run.variant]), run.variant
         assert (run.variant == BASE) == (not differing)
         assert run.seed in (0, 1)
+
+
+def test_flights_start_from_the_default_preset() -> None:
+    assert BASES["fixed"] == preset("diffusion_sac", "default")
 
 
 def test_a_nested_change_keeps_its_neighbours() -> None:

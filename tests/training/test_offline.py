@@ -317,3 +317,10 @@ def test_discounting_per_second_is_judged_by_the_shortest_step(flown: Transition
 def test_evaluation_seeds_are_refused() -> None:
     with pytest.raises(ValueError, match="seed"):
         config(seed=1_000_000)
+
+
+def test_the_level_is_pinned_only_where_no_flight_can_end_by_itself(flown: Transitions) -> None:
+    plan = config(agent={"pinned_level": True})
+    assert OfflineLearner(plan, flown).agent.config == plan.agent
+    ends = plan.model_copy(update={"scenario": SCENARIO.replace(energy_budget_j=1e6)})
+    assert not OfflineLearner(ends, flown).agent.config.pinned_level  # type: ignore[attr-defined]  # Diffusion-SAC's

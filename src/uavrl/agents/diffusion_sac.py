@@ -45,8 +45,25 @@ class DiffusionSacConfig(AgentConfig):
     name: Literal["diffusion_sac"] = "diffusion_sac"
     diffusion: DiffusionConfig = DiffusionConfig()
     learning_rate: float = Field(1e-3, gt=0, description="of Adam")
+    discount: float = Field(
+        0.998,
+        ge=0,
+        lt=1,
+        description="gamma, per step or per second; a flight to a better place pays over all that follow",
+    )
     polyak: float = Field(
-        0.03, gt=0, le=1, description="rate of the target critic; a chain of 1/gamma backups needs many"
+        0.1, gt=0, le=1, description="rate of the target critic; a chain of 1 / (1 - gamma) backups needs many"
+    )
+    action_noise: float = Field(
+        0.1,
+        ge=0,
+        description="standard deviation of noise on w where Q is asked, in the backup and in L_g (target policy "
+        "smoothing, Fujimoto et al. 2018): a move costs its length, a cone whose tip would hold w at 0. Paper: 0",
+    )
+    pinned_level: bool = Field(
+        False,
+        description="subtract the batch's mean from Q' in the backup (as relative value iteration does): differences "
+        "need not wait for a level that is 1 / (1 - gamma) rewards away. Not for data that can terminate",
     )
     bc_weight: float = Field(0.02, ge=0, le=1, description="eta of eq. (actor_loss_all)")
     cql_weight: float = Field(0.0, ge=0, description="alpha of eq. (crtici_CQL); 0 skips the penalty")
@@ -105,18 +122,24 @@ class DiffusionSac(Agent):
             "critic": adam(self.critic.parameters(), config),
         }
 
-    def critic_loss(self, batch: Batch, noise: ChainNoise, uniform: Tensor | None) -> tuple[Tensor, Metrics]:
+    def critic_loss(
+        self, batch: Batch, noise: ChainNoise, uniform: Tensor | None, jitter: Tensor | None = None
+    ) -> tuple[Tensor, Metrics]:
         """Eq. (crtici_CQL), both Q functions summed.
 
         Args:
             batch: B transitions.
             noise: of the target actor's chain at s', B samples.
             uniform: (B x cql_samples, C) displacements in [-1, 1] of the penalty; None where its weight is 0.
+            jitter: (B, C) standard normal noise of w' in the backup; None: no action noise.
         """
         with torch.no_grad():
             vector = self.actor.sample(self.actor.average, self.actor.average.encode(batch.next_observation), noise)
             following = decode(vector, self.spaces.continuous)
+            following = following._replace(continuous=self._jittered(following.continuous, jitter))
             q_next = self._best(self.target, self.target.encode(batch.next_observation), following)[0]
+            if self.config.pinned_level:
+                q_next = q_next - q_next.mean()
             target = batch.reward + discounts(batch, self.config) * q_next
         context = self.critic.encode(batch.observation)
         q = action_value(self.critic, context, batch.action, self.spaces.choices)
@@ -128,7 +151,9 @@ class DiffusionSac(Agent):
             metrics["cql_penalty"] = penalty.detach()
         return loss, metrics | {"critic_loss": loss.detach()}
 
-    def actor_loss(self, batch: Batch, step: Tensor, noise: Tensor, chain: ChainNoise | None) -> tuple[Tensor, Metrics]:
+    def actor_loss(
+        self, batch: Batch, step: Tensor, noise: Tensor, chain: ChainNoise | None, jitter: Tensor | None = None
+    ) -> tuple[Tensor, Metrics]:
         """Eq. (actor_loss_all).
 
         Args:
@@ -136,6 +161,7 @@ class DiffusionSac(Agent):
             step: (B,) denoising steps in 1..M of L_bc, and of a one-step L_g.
             noise: (B, C + D) of the same.
             chain: of the chain whose actions L_g judges; None where the gradient is one_step or L_g has no weight.
+            jitter: (B, C) standard normal noise of w in L_g; None: no action noise.
         """
         config, denoiser = self.config, self.actor.denoiser
         context = denoiser.encode(batch.observation)
@@ -155,15 +181,21 @@ class DiffusionSac(Agent):
                 steps = config.gradient_steps if config.gradient == "last_k" else None
                 vector = self.actor.sample(denoiser, context, chain, steps)
             assert vector is not None  # noqa: S101  # for the type checker: one of the two branches above has run
-            guidance, more = self.guidance_loss(batch.observation, vector)
+            guidance, more = self.guidance_loss(batch.observation, vector, jitter)
             loss = loss + (1.0 - eta) * guidance
             metrics |= more
         return loss, metrics | {"actor_loss": loss.detach()}
 
-    def guidance_loss(self, observation: Observation, vector: Tensor) -> tuple[Tensor, Metrics]:
-        """Eq. (Q_guidance_Loss) of chain outputs `vector` (B, C + D), with gradient in both of its blocks."""
+    def guidance_loss(
+        self, observation: Observation, vector: Tensor, jitter: Tensor | None = None
+    ) -> tuple[Tensor, Metrics]:
+        """Eq. (Q_guidance_Loss) of chain outputs `vector` (B, C + D), with gradient in both of its blocks.
+
+        `jitter` (B, C) as in `actor_loss`.
+        """
         config, continuous = self.config, self.spaces.continuous
         w, z = straight_through_clamp(vector[:, :continuous]), vector[:, continuous:]
+        w = self._jittered(w, jitter)
         probability = functional.softmax(z / config.choice_temperature, dim=-1)
         with torch.no_grad():
             context = self.critic.encode(observation)
@@ -194,7 +226,11 @@ class DiffusionSac(Agent):
         if config.cql_weight > 0:
             shape = (count * config.cql_samples, continuous)
             uniform = 2.0 * torch.rand(shape, generator=generator, device=device) - 1.0
-        loss, metrics = self.critic_loss(batch, chain, uniform)
+        jitter: tuple[Tensor, Tensor] | tuple[None, None] = (None, None)
+        if config.action_noise > 0:
+            first, second = torch.randn((2, count, continuous), generator=generator, device=device)
+            jitter = (first, second)
+        loss, metrics = self.critic_loss(batch, chain, uniform, jitter[0])
         clip = config.gradient_clip
         metrics["critic_gradient"] = minimise(loss, self.critic, self.optimisers["critic"], clip)
 
@@ -202,7 +238,7 @@ class DiffusionSac(Agent):
         noise = torch.randn((count, size), generator=generator, device=device)
         guided = config.bc_weight < 1 and config.gradient != "one_step"
         chain_for_actor = ChainNoise.draw(count, size, steps, generator) if guided else None
-        loss, more = self.actor_loss(batch, step, noise, chain_for_actor)
+        loss, more = self.actor_loss(batch, step, noise, chain_for_actor, jitter[1])
         metrics["actor_gradient"] = minimise(loss, self.actor.denoiser, self.optimisers["actor"], clip)
 
         move_towards(self.target, self.critic, config.polyak)
@@ -221,6 +257,10 @@ class DiffusionSac(Agent):
         rows = len(q) // count
         best = q.view(rows, count).argmax(dim=1) + count * torch.arange(rows, device=q.device)
         return HybridAction(drawn.continuous[best], choice[best])
+
+    def _jittered(self, w: Tensor, jitter: Tensor | None) -> Tensor:
+        """w (B, C) with action noise, in the box; its gradient leads back into the box, not out of it."""
+        return w if jitter is None else straight_through_clamp(w + self.config.action_noise * jitter)
 
     def _best(self, critic: Critic, context: Context, action: HybridAction) -> tuple[Tensor, Tensor]:
         """(min Q, choice), each (B,), of w with its own choice, or with the best one where the config says so."""

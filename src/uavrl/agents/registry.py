@@ -47,7 +47,7 @@ _PAPER_CRITIC: dict[str, Any] = {"discount": 0.99, "polyak": 0.005, "huber": Non
 
 PRESETS: dict[str, dict[str, Offline]] = {
     "diffusion_sac": {
-        "default": DiffusionSacConfig(),
+        "default": DiffusionSacConfig(pinned_level=True),
         "paper": DiffusionSacConfig(
             network=_PAPER_NETWORK,
             diffusion=_PAPER_CHAIN,
@@ -64,6 +64,7 @@ PRESETS: dict[str, dict[str, Offline]] = {
             huber=None,
             greedy_choice=False,
             displacement_weight=1.0,
+            action_noise=0.0,
         ),
     },
     "cql": {

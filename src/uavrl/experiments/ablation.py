@@ -35,8 +35,9 @@ BANDIT = DiffusionSacConfig(
     cql_weight=0.05,
     cql_samples=4,
     greedy_choice=False,
+    action_noise=0.0,
 )
-FLIGHT = DiffusionSacConfig()
+FLIGHT = DiffusionSacConfig(pinned_level=True)  # the default preset
 BASES = {"bandit": BANDIT, "fixed": FLIGHT}
 UPDATES = {"bandit": 2_500, "fixed": 2_000}
 
@@ -65,6 +66,9 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "displacement weight 1": {"displacement_weight": 1.0},
     "displacement weight 10": {"displacement_weight": 10.0},
     "rewards not centred": {"reward": {"transform": "none"}},
+    "no action noise": {"action_noise": 0.0},
+    "level not pinned": {"pinned_level": False},
+    "discount .99": {"discount": 0.99},
     "no conservative penalty": {"cql_weight": 0.0},
     "conservative penalty .3": {"cql_weight": 0.3},
 }

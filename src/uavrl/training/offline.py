@@ -91,9 +91,12 @@ class OfflineLearner:
             **{field.name: getattr(data, field.name) for field in fields(Batch) if field.name != "reward"},
             reward=transformed(data.reward, self.shift, factor, reward),
         )
+        agent = config.agent
+        if terminates and isinstance(agent, DiffusionSacConfig):
+            agent = agent.model_copy(update={"pinned_level": False})  # as the shift: an end is compared with the level
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
-            self.agent = make_agent(spaces_of(config.scenario, config.agent.network.kind), config.agent)
+            self.agent = make_agent(spaces_of(config.scenario, config.agent.network.kind), agent)
         fit_normalisers(self.agent.networks, data.observation)
         self.agent.networks.to(self.device)
         self.data = _to(data, self.device)
