@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -98,3 +99,20 @@ def test_a_directory_of_another_run_is_left_alone(folder: Path, capsys: pytest.C
     assert collect("--out", "run", *SMALL) == 0
     assert collect("--out", "run", *SMALL, "--seed", "1") == 2
     assert "holds a run of other settings" in capsys.readouterr().err
+
+
+def test_tensorboard_that_is_not_installed_is_one_line_before_anything_flies(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    assert collect("--out", "run", *SMALL, "--tensorboard") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("uavrl: error: ")
+    assert "extra 'tracking'" in line
+    assert not (folder / "run").exists()
+
+
+def test_the_log_is_written_for_tensorboard_too(folder: Path) -> None:
+    pytest.importorskip("tensorboard")
+    assert collect("--out", "run", *SMALL, "--tensorboard") == 0
+    assert list((folder / "run/tensorboard").glob("events.out.tfevents.*"))

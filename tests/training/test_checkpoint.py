@@ -159,6 +159,7 @@ def writers_come_and_die(folder: Path, plan: list[tuple[int, float, bool]]) -> N
         killed = False
         with pytest.MonkeyPatch.context() as patch:
             kill(patch, operation, share)  # without the disk's own waiting
+            patch.setattr(os, "getpid", lambda number=number: 9000 - number)  # each a process of its own
             try:
                 save(place, number)
             except Killed:
