@@ -15,6 +15,7 @@ from torch import Tensor
 from uavrl.actions import HybridAction
 from uavrl.agents.base import Agent, Batch
 from uavrl.networks import Spaces
+from uavrl.training.fit import learn_once
 
 CHOICES = 11
 ACTIONS = 10_000
@@ -46,11 +47,10 @@ class HybridBandit:
         reward = worth[choice] + NOISE * torch.randn(ACTIONS, generator=generator)
         return cls(modes, worth, HybridAction(w, choice), reward)
 
-    def batch(self, rows: Tensor, shift: float) -> Batch:
-        """Rows of the log as episodes of one step, rewards less `shift`."""
-        state, one = torch.zeros(len(rows), 1), torch.ones(len(rows))
-        action = HybridAction(self.action.continuous[rows], self.action.choice[rows])
-        return Batch(state, action, self.reward[rows] - shift, one, one, state)
+    def batch(self, shift: float) -> Batch:
+        """The log as episodes of one step, rewards less `shift`."""
+        state, one = torch.zeros(ACTIONS, 1), torch.ones(ACTIONS)
+        return Batch(state, self.action, self.reward - shift, one, one, state)
 
     def score(self, action: HybridAction) -> dict[str, float]:
         """Shares of actions with the best choice, with a displacement near its mode, and with both."""
@@ -64,13 +64,12 @@ class HybridBandit:
 def fit_bandit(agent: Agent, bandit: HybridBandit, updates: int, seed: int) -> None:
     """Learn from the log, its median reward taken off where the agent's settings centre rewards, rate falling to 0."""
     generator = torch.Generator().manual_seed(seed)
-    shift = float(bandit.reward.median()) if agent.config.reward.transform == "centred" else 0.0
+    data = bandit.batch(float(bandit.reward.median()) if agent.config.reward.transform == "centred" else 0.0)
     for update in range(updates):
         for optimiser in agent.optimisers.values():
             for group in optimiser.param_groups:
                 group["lr"] = agent.config.learning_rate * 0.5 * (1 + math.cos(math.pi * update / updates))
-        rows = torch.randint(0, ACTIONS, (agent.config.batch_size,), generator=generator)
-        agent.update(bandit.batch(rows, shift), generator)
+        learn_once(agent, data, generator)
 
 
 def samples(agent: Agent, seed: int, count: int = 2_000) -> HybridAction:
