@@ -7,6 +7,8 @@ Actor, eqs. (diffRL_loss), (Q_guidance_Loss), (actor_loss_all):
     L = \eta L_bc + (1 - \eta) L_g,   L_g = -E[\sum_d p_d \min_j Q_j(s, w, d)] / sg(mean |Q|),  p = softmax(z / \tau)
 where [w, z] is what the denoising chain returns. The guidance must reach the actor's weights through that chain, for w
 and for z alike: an argmax or a sampler without graph would leave nothing but behaviour cloning.
+
+Beyond the paper: `action_noise` on w wherever Q is asked, `pinned_level` and `greedy_choice` in the backup.
 """
 
 from __future__ import annotations
