@@ -34,6 +34,13 @@ EVERY = [(name, kind) for name in NAMES for kind in KINDS]
 ALL = pytest.mark.parametrize(("name", "kind"), EVERY)
 
 
+@ALL
+def test_weight_decay_reaches_every_network_and_no_temperature(name: str, kind: Kind) -> None:
+    for part, optimiser in agent(name, kind, weight_decay=0.3).optimisers.items():
+        expected = 0.0 if part == "temperature" else 0.3
+        assert [group["weight_decay"] for group in optimiser.param_groups] == [expected], part
+
+
 def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 

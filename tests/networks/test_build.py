@@ -56,3 +56,15 @@ def test_fit_reaches_every_normaliser_and_leaves_sets_alone() -> None:
     before = {name: value.clone() for name, value in sets.state_dict().items()}
     fit_normalisers(sets, observation("devices", 40))
     assert all(torch.equal(before[name], value) for name, value in sets.state_dict().items())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_layer_normalisation_is_asked_for_in_the_critic_alone(kind: Kind) -> None:
+    def norms(layer_norm: bool) -> list[int]:
+        made = [maker(spaces(kind), network(kind, layer_norm=layer_norm)) for maker in (make_critic, make_denoiser)]
+        return [sum(isinstance(module, torch.nn.LayerNorm) for module in one.modules()) for one in made]
+
+    assert norms(False) == [0, 0]
+    critic, denoiser = norms(True)
+    assert critic > 0
+    assert denoiser == 0

@@ -24,8 +24,8 @@ def seen(devices: int = K, seed: int = 0) -> Devices:
     return found
 
 
-def critic() -> Network:
-    made = SetCritic(2, width=16, scale_m=500.0, reach_m=25.0)
+def critic(layer_norm: bool = False) -> Network:
+    made = SetCritic(2, width=16, scale_m=500.0, reach_m=25.0, layer_norm=layer_norm)
     disturb(made, 0)
     return lambda s, w, _: made.all_choices(made.encode(s), w).permute(1, 2, 0)
 
@@ -88,6 +88,7 @@ def unconditional() -> SetConditional:
 
 NETWORKS = {
     "critic": critic,
+    "normalised critic": lambda: critic(layer_norm=True),
     "denoiser": denoiser,
     "actor": actor,
     "choice actor": choice_actor,
@@ -178,6 +179,19 @@ def test_value_is_the_entry_of_all_choices() -> None:
         one_hot = torch.zeros(ROWS, K + 1)
         one_hot[:, choice] = 1.0
         torch.testing.assert_close(made.value(context, w, one_hot), table[:, :, choice])
+
+
+def test_layer_normalisation_bounds_q_however_far_the_observation_is() -> None:
+    """Ball et al. (2023), "Efficient online RL with offline data": what makes it worth having in a critic."""
+    near, w = seen(), torch.zeros(ROWS, 2)
+    far = near | {"devices": near["devices"] * torch.tensor([1e4, 1e4, 1.0, 1.0, 1.0, 1.0])}
+
+    def moved(layer_norm: bool) -> float:
+        network = critic(layer_norm)
+        return float((run(network, far, w, w) - run(network, near, w, w)).abs().max())
+
+    assert moved(layer_norm=False) > 100.0
+    assert moved(layer_norm=True) < 20.0
 
 
 def test_the_two_q_functions_differ_and_a_shift_moves_every_value_of_both() -> None:

@@ -54,6 +54,9 @@ class AgentConfig(BaseModel):
     reward: RewardConfig = RewardConfig()
     batch_size: int = Field(256, ge=1, description="transitions an update")
     learning_rate: float = Field(3e-4, gt=0, description="of Adam")
+    weight_decay: float = Field(
+        0.0, ge=0, description="of every network, decoupled (Loshchilov and Hutter 2019): weights shrink by rate x this"
+    )
     discount: float = Field(0.99, ge=0, lt=1, description="gamma, per step or per second")
     discount_per: Literal["step", "second"] = Field(
         "step", description="per second: gamma^duration, the semi-Markov discount of a per-second objective"
@@ -127,6 +130,6 @@ def move_towards(target: nn.Module, source: nn.Module, rate: float) -> None:
         mine.copy_(theirs)
 
 
-def adam(parameters: Iterable[Tensor], config: AgentConfig) -> torch.optim.Optimizer:
-    """The optimiser of every network, fused."""
-    return torch.optim.Adam(parameters, lr=config.learning_rate, fused=True)
+def adam(parameters: Iterable[Tensor], learning_rate: float, weight_decay: float = 0.0) -> torch.optim.Optimizer:
+    """The optimiser of everything that is trained, fused; weight decay is the decoupled one."""
+    return torch.optim.AdamW(parameters, lr=learning_rate, weight_decay=weight_decay, fused=True)

@@ -35,7 +35,7 @@ class NetworkConfig(BaseModel):
     width: int = Field(64, ge=1, description="units of a hidden layer")
     depth: int = Field(3, ge=1, description="hidden layers of a perceptron")
     activation: Literal["silu", "mish", "relu"] = Field("silu", description="of a perceptron")
-    layer_norm: bool = Field(False, description="layer normalisation in a perceptron critic")
+    layer_norm: bool = Field(False, description="layer normalisation in the critic")
     choice_heads: bool = Field(True, description="perceptron critic: one output a choice; false: choice is an input")
     log_inputs: bool = Field(True, description="perceptron: log(1 + |s|) of each entry beside the entry itself")
     scale_m: float = Field(500.0, gt=0, description="set network: distances are divided by this (m)")
@@ -69,7 +69,13 @@ def make_critic(spaces: Spaces, config: NetworkConfig) -> Critic:
     """Two Q functions."""
     if config.kind == "devices":
         _needs_set(spaces, config)
-        return SetCritic(spaces.continuous, width=config.width, scale_m=config.scale_m, reach_m=config.reach_m)
+        return SetCritic(
+            spaces.continuous,
+            width=config.width,
+            scale_m=config.scale_m,
+            reach_m=config.reach_m,
+            layer_norm=config.layer_norm,
+        )
     return MlpCritic(
         _flat_size(spaces, config),
         spaces.continuous,

@@ -70,12 +70,13 @@ class SetTrunk(nn.Module):
     """Tokens (B, K, .) and globals (B, .) to hidden vectors of both; `extra` inputs join the encoded ones later.
 
     Pooling is the mean and `HEADS` softmax-weighted means of the tokens, one matrix product in all: a maximum costs as
-    much as a layer on a CPU. Padded devices have weight 0.
+    much as a layer on a CPU. Padded devices have weight 0. Layer normalisation, where asked for, comes before each
+    activation but the first.
     """
 
     HEADS = 3
 
-    def __init__(self, token_extra: int, global_extra: int, width: int) -> None:
+    def __init__(self, token_extra: int, global_extra: int, width: int, layer_norm: bool = False) -> None:
         super().__init__()
         self.width = width
         self.token = nn.Linear(TOKEN_FEATURES, width)
@@ -89,6 +90,7 @@ class SetTrunk(nn.Module):
         self.global_hidden = nn.Linear(width, width)
         self.token_out = nn.Linear(width, width)
         self.global_out = nn.Linear(width, width, bias=False)
+        self.norms = nn.ModuleList(nn.LayerNorm(width) if layer_norm else nn.Identity() for _ in range(4))
 
     def encode(self, tokens: Tensor, globals_: Tensor) -> tuple[Tensor, Tensor]:
         """The first layer's observation part."""
@@ -104,23 +106,23 @@ class SetTrunk(nn.Module):
             flat = token_extra.reshape(-1, token_extra.shape[-1])
             token = torch.addmm(token.reshape(-1, self.width), flat, self.token_extra.weight.T).view_as(token)
         hidden = functional.silu(token + self.global_to_token(globals_)[:, None])
-        hidden = functional.silu(self.token_hidden(hidden))
+        hidden = functional.silu(self.norms[0](self.token_hidden(hidden)))
         mask = valid[:, None]
         score = self.score(hidden).transpose(1, 2) + (mask - 1.0) * -NEVER
         weight = torch.cat([mask / mask.sum(dim=2, keepdim=True), score.softmax(dim=2)], dim=1)
-        globals_ = functional.silu(globals_ + self.pool((weight @ hidden).flatten(1)))
-        globals_ = functional.silu(self.global_hidden(globals_))
-        hidden = functional.silu(self.token_out(hidden) + self.global_out(globals_)[:, None])
+        globals_ = functional.silu(self.norms[1](globals_ + self.pool((weight @ hidden).flatten(1))))
+        globals_ = functional.silu(self.norms[2](self.global_hidden(globals_)))
+        hidden = functional.silu(self.norms[3](self.token_out(hidden) + self.global_out(globals_)[:, None]))
         return hidden, globals_
 
 
 class _SetQ(nn.Module):
     """One Q function with an output for each device and one for idling."""
 
-    def __init__(self, continuous: int, width: int, scale_m: float, reach_m: float) -> None:
+    def __init__(self, continuous: int, width: int, scale_m: float, reach_m: float, layer_norm: bool) -> None:
         super().__init__()
         self.scale_m, self.reach_m = scale_m, reach_m
-        self.trunk = SetTrunk(3, continuous + 1, width)
+        self.trunk = SetTrunk(3, continuous + 1, width, layer_norm)
         self.device_out = nn.Linear(width, 1)
         self.idle_out = nn.Linear(width, 1)
 
@@ -139,11 +141,13 @@ class _SetQ(nn.Module):
 class SetCritic(Critic):
     """Two Q functions over the set of devices; all K + 1 choices cost one pass."""
 
-    def __init__(self, continuous: int, *, width: int, scale_m: float, reach_m: float) -> None:
+    def __init__(
+        self, continuous: int, *, width: int, scale_m: float, reach_m: float, layer_norm: bool = False
+    ) -> None:
         super().__init__()
         self.scale_m = scale_m
-        self.first = _SetQ(continuous, width, scale_m, reach_m)
-        self.second = _SetQ(continuous, width, scale_m, reach_m)
+        self.first = _SetQ(continuous, width, scale_m, reach_m, layer_norm)
+        self.second = _SetQ(continuous, width, scale_m, reach_m, layer_norm)
 
     def encode(self, observation: Observation) -> Context:
         """First layers of both Q functions, validity and relative positions."""
