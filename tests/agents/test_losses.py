@@ -85,15 +85,15 @@ def test_penalty_is_the_log_of_the_integral_over_all_actions(kind: Kind, samples
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("greedy", [False, True])
-@pytest.mark.parametrize(("cql_weight", "per"), [(0.0, "step"), (0.7, "second")])
-def test_critic_loss_of_diffusion_sac(kind: Kind, cql_weight: float, per: str, greedy: bool) -> None:
+@pytest.mark.parametrize(("cql_weight", "samples", "per"), [(0.0, 2, "step"), (0.7, 2, "second"), (0.7, 0, "step")])
+def test_critic_loss_of_diffusion_sac(kind: Kind, cql_weight: float, samples: int, per: str, greedy: bool) -> None:
     """The target is of the target critic at the target actor's w, and its argmax d or the target critic's best d.
 
-    All four networks differ here.
+    The penalty integrates over w, or without samples sums over d at the logged w. All four networks differ here.
     """
     settings: dict[str, Any] = {
         "cql_weight": cql_weight,
-        "cql_samples": 2,
+        "cql_samples": samples,
         "discount": 0.8,
         "discount_per": per,
         "huber": None,
@@ -103,8 +103,8 @@ def test_critic_loss_of_diffusion_sac(kind: Kind, cql_weight: float, per: str, g
         disturb(network, seed)
     data = batch(kind, ROWS)
     chain = ChainNoise(noise(5, ROWS, 2 + D), noise(6, 3, ROWS, 2 + D))
-    uniform = noise(7, 2 * ROWS, 2).clamp(-1, 1) if cql_weight else None
-    loss, metrics = made.critic_loss(data, chain, uniform)
+    penalised = noise(7, samples * ROWS, 2).clamp(-1, 1) if samples else data.action.continuous
+    loss, metrics = made.critic_loss(data, chain, penalised if cql_weight else None)
 
     with torch.no_grad():
         context = made.actor.average.encode(data.next_observation)
@@ -118,11 +118,13 @@ def test_critic_loss_of_diffusion_sac(kind: Kind, cql_weight: float, per: str, g
         q = q_of(made.critic, row(data.observation, i), data.action.continuous[i], int(data.action.choice[i]))
         expected += 0.5 * float(((q - target) ** 2).sum()) / ROWS
         for j in range(2):
-            if uniform is None:
-                continue
+            if samples:
+                at, density = penalised[samples * i : samples * (i + 1)], 4 / samples
+            else:
+                at, density = penalised[i : i + 1], 1.0
             every = [
-                math.exp(q_of(made.critic, row(data.observation, i), uniform[2 * i + n], d)[j]) * 4 / 2
-                for n in range(2)
+                math.exp(q_of(made.critic, row(data.observation, i), one, d)[j]) * density
+                for one in at
                 for d in range(D)
             ]
             penalty += (math.log(sum(every)) - q[j]) / ROWS

@@ -69,7 +69,9 @@ class DiffusionSacConfig(AgentConfig):
     )
     bc_weight: float = Field(0.02, ge=0, le=1, description="eta of eq. (actor_loss_all)")
     cql_weight: float = Field(0.0, ge=0, description="alpha of eq. (crtici_CQL); 0 skips the penalty")
-    cql_samples: int = Field(10, ge=1, description="uniform displacements in the penalty's sum")
+    cql_samples: int = Field(
+        10, ge=0, description="uniform displacements in the penalty's sum; 0: the sum is over d alone, at the logged w"
+    )
     guidance: Literal["expectation", "straight_through", "softmax"] = Field(
         "expectation",
         description="choice in L_g: expected Q over p; argmax with p's gradient; or p itself as the critic's input",
@@ -125,14 +127,15 @@ class DiffusionSac(Agent):
         }
 
     def critic_loss(
-        self, batch: Batch, noise: ChainNoise, uniform: Tensor | None, jitter: Tensor | None = None
+        self, batch: Batch, noise: ChainNoise, penalised: Tensor | None, jitter: Tensor | None = None
     ) -> tuple[Tensor, Metrics]:
         """Eq. (crtici_CQL), both Q functions summed.
 
         Args:
             batch: B transitions.
             noise: of the target actor's chain at s', B samples.
-            uniform: (B x cql_samples, C) displacements in [-1, 1] of the penalty; None where its weight is 0.
+            penalised: (B x max(cql_samples, 1), C) displacements of the penalty, uniform in [-1, 1] or the logged ones;
+                None where its weight is 0.
             jitter: (B, C) standard normal noise of w' in the backup; None: no action noise.
         """
         with torch.no_grad():
@@ -147,8 +150,9 @@ class DiffusionSac(Agent):
         q = action_value(self.critic, context, batch.action, self.spaces.choices)
         loss = bellman_loss(q, target, self.config.huber)
         metrics = {"bellman_loss": loss.detach(), "q": q.detach().mean(), "target_q": target.mean()}
-        if uniform is not None:
-            penalty = conservative_penalty(self.critic, context, uniform, q)
+        if penalised is not None:
+            density = None if self.config.cql_samples > 0 else torch.zeros_like(batch.reward)  # no integral over w
+            penalty = conservative_penalty(self.critic, context, penalised, q, density)
             loss = loss + self.config.cql_weight * penalty
             metrics["cql_penalty"] = penalty.detach()
         return loss, metrics | {"critic_loss": loss.detach()}
@@ -224,15 +228,15 @@ class DiffusionSac(Agent):
         continuous, steps = self.spaces.continuous, config.diffusion.steps
         size = continuous + self.spaces.choices
         chain = ChainNoise.draw(count, size, steps, generator)
-        uniform = None
-        if config.cql_weight > 0:
+        penalised = batch.action.continuous if config.cql_weight > 0 else None
+        if config.cql_weight > 0 and config.cql_samples > 0:
             shape = (count * config.cql_samples, continuous)
-            uniform = 2.0 * torch.rand(shape, generator=generator, device=device) - 1.0
+            penalised = 2.0 * torch.rand(shape, generator=generator, device=device) - 1.0
         jitter: tuple[Tensor, Tensor] | tuple[None, None] = (None, None)
         if config.action_noise > 0:
             first, second = torch.randn((2, count, continuous), generator=generator, device=device)
             jitter = (first, second)
-        loss, metrics = self.critic_loss(batch, chain, uniform, jitter[0])
+        loss, metrics = self.critic_loss(batch, chain, penalised, jitter[0])
         clip = config.gradient_clip
         metrics["critic_gradient"] = minimise(loss, self.critic, self.optimisers["critic"], clip)
 
