@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.stats import t
 
 from uavrl.agents.diffusion_sac import DiffusionSac, DiffusionSacConfig
+from uavrl.agents.registry import preset
 from uavrl.datasets import load_builtin
 from uavrl.evaluation.rollouts import evaluation_set, fly
 from uavrl.experiments.bandit import SPACES, HybridBandit, fit_bandit, samples
@@ -37,7 +38,8 @@ BANDIT = DiffusionSacConfig(
     greedy_choice=False,
     action_noise=0.0,
 )
-FLIGHT = DiffusionSacConfig(pinned_level=True)  # the default preset
+FLIGHT = preset("diffusion_sac", "default")
+assert isinstance(FLIGHT, DiffusionSacConfig)  # noqa: S101  # for the type checker
 BASES = {"bandit": BANDIT, "fixed": FLIGHT}
 UPDATES = {"bandit": 2_500, "fixed": 2_000}
 

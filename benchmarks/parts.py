@@ -1,0 +1,96 @@
+"""Whose part is the excess: a critic's policy with the hover heuristic's moves, and with its choice of device.
+
+    python -m benchmarks.parts runs/layouts [MORE ...] > results/parts.md
+
+On trial flights of preset `released`, which no evaluation uses.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from uavrl.agents.diffusion_sac import DiffusionSac
+from uavrl.evaluation.rollouts import Flights, evaluation_set, fly
+from uavrl.policies import make_policy
+from uavrl.policies.base import Policy
+from uavrl.scenario import load_scenario
+from uavrl.simulation.observations import devices_observation
+from uavrl.simulation.state import FlightAction
+from uavrl.training.batches import to_tensors
+from uavrl.training.policy import AgentPolicy, load_policy
+
+TRIAL_SEED = 500_000
+LAYOUTS, FADINGS = 100, 3
+STUCK = 0.2  # of the steps after the first hundred
+
+
+class Swapped:
+    """Hover's moves with the critic's best device for them, or the agent's moves with hover's devices."""
+
+    needs: Literal["paper", "devices", "state"] = "state"
+
+    def __init__(self, learned: AgentPolicy, moves: str) -> None:
+        self.learned, self.moves, self.name = learned, moves, f"{moves} moves"
+        self.hover: Policy = make_policy("hover")
+
+    def reset(self, count: int) -> None:
+        """Of both parts."""
+        self.hover.reset(count)
+        self.learned.reset(count)
+
+    def act(self, observation: Any, *, generator: np.random.Generator, deterministic: bool = False) -> FlightAction:
+        """One part of each."""
+        state = observation.state
+        seen = devices_observation(
+            observation.scenario, observation.layout_m, state.position_m, state.age_s, state.energy_j, state.used_j
+        )
+        arrays = {name: np.asarray(value, dtype=np.float32) for name, value in seen._asdict().items()}
+        known = self.hover.act(observation, generator=generator, deterministic=True)
+        if self.moves == "own":
+            own = self.learned.act(arrays, generator=generator, deterministic=True)
+            return FlightAction(own.displacement_m, known.device)
+        agent, tensors = self.learned.agent, to_tensors(arrays)
+        assert isinstance(agent, DiffusionSac)  # noqa: S101  # checked by `main`
+        w = torch.from_numpy(np.asarray(known.displacement_m) / self.learned.reach_m).float()
+        with torch.no_grad():
+            q = agent.critic.all_choices(agent.critic.encode(tensors), w).amin(dim=0)
+        return FlightAction(known.displacement_m, q.argmax(dim=-1).numpy())
+
+
+def line(name: str, flights: Flights) -> str:
+    """Returns, idling, and whether it ends in idling."""
+    returns = (flights.reward * flights.active).sum(axis=0)
+    half = 1.96 * returns.std(ddof=1) / len(returns) ** 0.5
+    idle = (flights.device == 0) & flights.active
+    early, late = idle[:100].mean(), idle[100:].mean()
+    stuck = (idle[100:].mean(axis=0) > STUCK).mean()
+    return (
+        f"| {name} | {returns.mean():.0f} ± {half:.0f} | {np.median(returns):.0f} | {100 * early:.1f} | "
+        f"{100 * late:.1f} | {100 * stuck:.0f} |"
+    )
+
+
+def main(paths: list[str]) -> None:
+    """Print the table."""
+    torch.set_num_threads(1)
+    scenario = load_scenario("released")
+    trial = evaluation_set(scenario, "random", LAYOUTS, seed=TRIAL_SEED, fading_seeds=FADINGS)
+    print("| policy | return | median | idle, first 100 steps, % | idle after, % | flights that idle on, % |")
+    print("|---|---|---|---|---|---|")
+    print(line("hover", fly(make_policy("hover"), trial)))
+    for path in paths:
+        policy = load_policy(Path(path), scenario)
+        if not isinstance(policy.agent, DiffusionSac) or policy.needs != "devices":
+            sys.exit(f"{path}: allowed here: Diffusion-SAC with a set network")
+        print(line(path, fly(policy, trial, deterministic=True)))
+        print(line("- hover's moves, its devices", fly(Swapped(policy, "hover's"), trial)))
+        print(line("- its moves, hover's devices", fly(Swapped(policy, "own"), trial)), flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
