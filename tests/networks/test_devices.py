@@ -194,6 +194,15 @@ def test_layer_normalisation_bounds_q_however_far_the_observation_is() -> None:
     assert moved(layer_norm=True) < 20.0
 
 
+def test_every_normalisation_of_a_critic_is_in_use() -> None:
+    made = SetCritic(2, width=16, scale_m=500.0, reach_m=25.0, layer_norm=True)
+    disturb(made, 0)
+    weights = [module.weight for module in made.modules() if isinstance(module, torch.nn.LayerNorm)]
+    assert len(weights) == 2 * 4
+    found = torch.autograd.grad(made.all_choices(made.encode(seen()), torch.zeros(ROWS, 2)).sum(), weights)
+    assert all(slope.norm() > 1e-6 for slope in found)
+
+
 def test_the_two_q_functions_differ_and_a_shift_moves_every_value_of_both() -> None:
     made = SetCritic(2, width=16, scale_m=500.0, reach_m=25.0)
     context, w = made.encode(seen()), noise(1, ROWS, 2)
