@@ -21,13 +21,14 @@ from tests.agents.problems import (
     diffusion_sac,
     disturb,
     equal,
+    network,
     observation,
     spaces,
 )
 from uavrl.agents.base import Agent
 from uavrl.agents.registry import PRESETS, make_agent, preset
 from uavrl.errors import CheckpointError, ConfigError
-from uavrl.networks import Observation
+from uavrl.networks import Observation, Spaces
 from uavrl.training.checkpoint import agent_tensors, load_checkpoint, restore_agent, save_checkpoint
 
 EVERY = [(name, kind) for name in NAMES for kind in KINDS]
@@ -39,6 +40,12 @@ def test_weight_decay_reaches_every_network_and_no_temperature(name: str, kind: 
     for part, optimiser in agent(name, kind, weight_decay=0.3).optimisers.items():
         expected = 0.0 if part == "temperature" else 0.3
         assert [group["weight_decay"] for group in optimiser.param_groups] == [expected], part
+
+
+def test_a_single_choice_has_no_spread_to_scale_by() -> None:
+    alone = Spaces(observation=3, continuous=2, choices=1)
+    with pytest.raises(ConfigError, match="q_scale = 'spread', allowed with a single choice: 'absolute' or 'none'"):
+        make_agent(alone, preset("diffusion_sac", "default").model_copy(update={"network": network("mlp")}))
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -65,8 +72,8 @@ def test_update_reports_finite_numbers_and_moves_what_it_trains(name: str, kind:
         assert metrics
         assert all(value == value and abs(value) < 1e6 for value in metrics.values()), metrics
         assert metrics["actor_gradient"] > 0
-    for key, network in made.networks.items():
-        assert not equal(before[key], copies(network)), key
+    for key, part in made.networks.items():
+        assert not equal(before[key], copies(part)), key
 
 
 @ALL

@@ -37,6 +37,7 @@ from uavrl.agents.base import (
 from uavrl.agents.cql import conservative_penalty
 from uavrl.agents.diffusion_actor import ChainNoise, DiffusionActor, DiffusionConfig, block_mean
 from uavrl.diffusion import add_noise, predict_x0, straight_through_clamp
+from uavrl.errors import ConfigError
 from uavrl.networks import Critic, Observation, Spaces, make_critic, repeat
 from uavrl.networks.interfaces import Context
 
@@ -110,12 +111,18 @@ class DiffusionSacConfig(AgentConfig):
 
 
 class DiffusionSac(Agent):
-    """Diffusion-SAC for declared spaces."""
+    """Diffusion-SAC for declared spaces.
+
+    Raises:
+        ConfigError: a single choice, whose Q has no spread to scale L_g by.
+    """
 
     config: DiffusionSacConfig
     acts_best_deterministically = True  # the chain's noise is jitter, and every metre of it costs time
 
     def __init__(self, spaces: Spaces, config: DiffusionSacConfig) -> None:
+        if spaces.choices == 1 and config.q_scale == "spread" and config.bc_weight < 1:
+            raise ConfigError("q_scale = 'spread', allowed with a single choice: 'absolute' or 'none'")
         self.spaces, self.config = spaces, config
         self.actor = DiffusionActor(spaces, config.network, config.diffusion)
         self.critic = make_critic(spaces, config.network)
