@@ -1,8 +1,8 @@
 """Whose part is the excess: a critic's policy with the hover heuristic's moves, and with its choice of device.
 
-    python -m benchmarks.parts runs/layouts [MORE ...] > results/parts.md
+    python -m benchmarks.parts runs/layouts [MORE ...]
 
-On trial flights of preset `released`, which no evaluation uses.
+On trial flights of preset `released`, which no evaluation uses. The table in docs/what-matters.md is made of such.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from uavrl.scenario import load_scenario
 from uavrl.simulation.observations import devices_observation
 from uavrl.simulation.state import FlightAction
 from uavrl.training.batches import to_tensors
-from uavrl.training.policy import AgentPolicy, load_policy
+from uavrl.training.policy import AgentPolicy, load_policy, trained_scenario
 
 TRIAL_SEED = 500_000
 LAYOUTS, FADINGS = 100, 3
@@ -34,8 +34,8 @@ class Swapped:
 
     needs: Literal["paper", "devices", "state"] = "state"
 
-    def __init__(self, learned: AgentPolicy, moves: str) -> None:
-        self.learned, self.moves, self.name = learned, moves, f"{moves} moves"
+    def __init__(self, learned: AgentPolicy, agent: DiffusionSac, moves: Literal["own", "hover's"]) -> None:
+        self.learned, self.agent, self.moves, self.name = learned, agent, moves, f"{moves} moves"
         self.hover: Policy = make_policy("hover")
 
     def reset(self, count: int) -> None:
@@ -54,18 +54,18 @@ class Swapped:
         if self.moves == "own":
             own = self.learned.act(arrays, generator=generator, deterministic=True)
             return FlightAction(own.displacement_m, known.device)
-        agent, tensors = self.learned.agent, to_tensors(arrays)
-        assert isinstance(agent, DiffusionSac)  # noqa: S101  # checked by `main`
+        tensors = to_tensors(arrays)
         w = torch.from_numpy(np.asarray(known.displacement_m) / self.learned.reach_m).float()
         with torch.no_grad():
-            q = agent.critic.all_choices(agent.critic.encode(tensors), w).amin(dim=0)
+            q = self.agent.critic.all_choices(self.agent.critic.encode(tensors), w).amin(dim=0)
         return FlightAction(known.displacement_m, q.argmax(dim=-1).numpy())
 
 
 def line(name: str, flights: Flights) -> str:
     """Returns, idling, and whether it ends in idling."""
     returns = (flights.reward * flights.active).sum(axis=0)
-    half = 1.96 * returns.std(ddof=1) / len(returns) ** 0.5
+    of_layout = returns.reshape(LAYOUTS, FADINGS).mean(axis=1)
+    half = 1.96 * of_layout.std(ddof=1) / len(of_layout) ** 0.5
     idle = (flights.device == 0) & flights.active
     early, late = idle[:100].mean(), idle[100:].mean()
     stuck = (idle[100:].mean(axis=0) > STUCK).mean()
@@ -85,11 +85,12 @@ def main(paths: list[str]) -> None:
     print(line("hover", fly(make_policy("hover"), trial)))
     for path in paths:
         policy = load_policy(Path(path), scenario)
-        if not isinstance(policy.agent, DiffusionSac) or policy.needs != "devices":
-            sys.exit(f"{path}: allowed here: Diffusion-SAC with a set network")
+        agent = policy.agent
+        if not isinstance(agent, DiffusionSac) or policy.needs != "devices" or trained_scenario(Path(path)) != scenario:
+            sys.exit(f"{path}: allowed here: Diffusion-SAC with a set network, trained in preset 'released'")
         print(line(path, fly(policy, trial, deterministic=True)))
-        print(line("- hover's moves, its devices", fly(Swapped(policy, "hover's"), trial)))
-        print(line("- its moves, hover's devices", fly(Swapped(policy, "own"), trial)), flush=True)
+        print(line("- hover's moves, its devices", fly(Swapped(policy, agent, "hover's"), trial)))
+        print(line("- its moves, hover's devices", fly(Swapped(policy, agent, "own"), trial)), flush=True)
 
 
 if __name__ == "__main__":

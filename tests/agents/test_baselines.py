@@ -181,24 +181,6 @@ def test_uniform_displacements_of_an_update_fill_the_box(name: str, monkeypatch:
     assert not torch.equal(drawn.here, drawn.after)
 
 
-def test_without_samples_an_update_penalises_choices_at_the_logged_displacement(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    seen: list[tuple[Tensor, Tensor | None]] = []
-
-    def watched(critic: Any, context: Any, w: Tensor, q_data: Tensor, density: Tensor | None) -> Tensor:
-        seen.append((w, density))
-        return conservative_penalty(critic, context, w, q_data, density)
-
-    monkeypatch.setattr(diffusion_sac_module, "conservative_penalty", watched)
-    data = batch("mlp", 20)
-    agent("diffusion_sac", "mlp", cql_weight=1.0, cql_samples=0).update(data, torch.Generator().manual_seed(0))
-    ((w, density),) = seen
-    assert torch.equal(w, data.action.continuous)
-    assert density is not None
-    assert not density.any()
-
-
 def test_a_penalised_critic_holds_what_is_not_in_the_data_under_what_is() -> None:
     """The choice 1 never occurs and equal rewards say nothing of it: without a penalty it is worth as much."""
     found = {}

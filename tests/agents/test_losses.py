@@ -103,8 +103,8 @@ def test_critic_loss_of_diffusion_sac(kind: Kind, cql_weight: float, samples: in
         disturb(network, seed)
     data = batch(kind, ROWS)
     chain = ChainNoise(noise(5, ROWS, 2 + D), noise(6, 3, ROWS, 2 + D))
-    penalised = noise(7, samples * ROWS, 2).clamp(-1, 1) if samples else data.action.continuous
-    loss, metrics = made.critic_loss(data, chain, penalised if cql_weight else None)
+    uniform = noise(7, samples * ROWS, 2).clamp(-1, 1) if samples else data.action.continuous
+    loss, metrics = made.critic_loss(data, chain, uniform if cql_weight and samples else None)
 
     with torch.no_grad():
         context = made.actor.average.encode(data.next_observation)
@@ -119,9 +119,9 @@ def test_critic_loss_of_diffusion_sac(kind: Kind, cql_weight: float, samples: in
         expected += 0.5 * float(((q - target) ** 2).sum()) / ROWS
         for j in range(2):
             if samples:
-                at, density = penalised[samples * i : samples * (i + 1)], 4 / samples
+                at, density = uniform[samples * i : samples * (i + 1)], 4 / samples
             else:
-                at, density = penalised[i : i + 1], 1.0
+                at, density = uniform[i : i + 1], 1.0
             every = [
                 math.exp(q_of(made.critic, row(data.observation, i), one, d)[j]) * density
                 for one in at

@@ -3,12 +3,15 @@ r"""Diffusion-SAC (paper, Section V, Algorithm 2): a diffusion actor guided by a
 Critic, eqs. (bellman_error), (crtici_CQL), for each Q_j:
     L = 1/2 E[(Q_j(s, a) - r - \gamma \min_j Q'_j(s', a'))^2]
         + \alpha E[\log \sum_d E_{w \sim U}[e^{Q_j(s, w, d)}] 2^C - Q_j(s, a)],   a' from the target actor
+    or with cql_samples = 0 \alpha E[\log \sum_d e^{Q_j(s, w, d)} - Q_j(s, a)] at the logged w, the cross-entropy of the
+    logged choice under softmax(Q_j)
 Actor, eqs. (diffRL_loss), (Q_guidance_Loss), (actor_loss_all):
-    L = \eta L_bc + (1 - \eta) L_g,   L_g = -E[\sum_d p_d \min_j Q_j(s, w, d)] / sg(mean |Q|),  p = softmax(z / \tau)
+    L = \eta L_bc + (1 - \eta) L_g,   L_g = -E[\sum_d p_d \min_j Q_j(s, w, d)] / sg(scale of Q), p = softmax(z / \tau)
 where [w, z] is what the denoising chain returns. The guidance must reach the actor's weights through that chain, for w
 and for z alike: an argmax or a sampler without graph would leave nothing but behaviour cloning.
 
-Beyond the paper: `action_noise` on w wherever Q is asked, `pinned_level` and `greedy_choice` in the backup.
+Beyond the paper: `action_noise` on w in the backup and in L_g, `pinned_level` and `greedy_choice` in the backup, the
+penalty over choices alone.
 """
 
 from __future__ import annotations
@@ -71,7 +74,7 @@ class DiffusionSacConfig(AgentConfig):
     bc_weight: float = Field(0.02, ge=0, le=1, description="eta of eq. (actor_loss_all)")
     cql_weight: float = Field(0.0, ge=0, description="alpha of eq. (crtici_CQL); 0 skips the penalty")
     cql_samples: int = Field(
-        10, ge=0, description="uniform displacements in the penalty's sum; 0: the sum is over d alone, at the logged w"
+        10, ge=0, description="uniform w that stand for the penalty's integral; 0: at the logged w, over d alone"
     )
     guidance: Literal["expectation", "straight_through", "softmax"] = Field(
         "expectation",
@@ -93,7 +96,7 @@ class DiffusionSacConfig(AgentConfig):
     greedy_choice: bool = Field(
         True,
         description="d' of the backup and d of a decision: the critic's best for the actor's w; false: the actor's own "
-        "(paper). The critic knows every choice from one pass, and the data hold all of them",
+        "(paper). The critic knows every choice from one pass, and the data hold all of them, some rarely",
     )
     candidates: int = Field(1, ge=1, description="actions drawn at a decision; the one of largest min Q is taken")
 
@@ -134,15 +137,14 @@ class DiffusionSac(Agent):
         }
 
     def critic_loss(
-        self, batch: Batch, noise: ChainNoise, penalised: Tensor | None, jitter: Tensor | None = None
+        self, batch: Batch, noise: ChainNoise, uniform: Tensor | None, jitter: Tensor | None = None
     ) -> tuple[Tensor, Metrics]:
         """Eq. (crtici_CQL), both Q functions summed.
 
         Args:
             batch: B transitions.
             noise: of the target actor's chain at s', B samples.
-            penalised: (B x max(cql_samples, 1), C) displacements of the penalty, uniform in [-1, 1] or the logged ones;
-                None where its weight is 0.
+            uniform: (B x cql_samples, C) displacements in [-1, 1] of the penalty; None where it has none, or no weight.
             jitter: (B, C) standard normal noise of w' in the backup; None: no action noise.
         """
         with torch.no_grad():
@@ -153,13 +155,18 @@ class DiffusionSac(Agent):
             if self.config.pinned_level:
                 q_next = q_next - q_next.mean()
             target = batch.reward + discounts(batch, self.config) * q_next
-        context = self.critic.encode(batch.observation)
-        q = action_value(self.critic, context, batch.action, self.spaces.choices)
+        context, penalty = self.critic.encode(batch.observation), None
+        if self.config.cql_weight > 0 and self.config.cql_samples == 0:
+            every = self.critic.all_choices(context, batch.action.continuous)
+            q = every.gather(2, batch.action.choice.expand(2, -1)[..., None]).squeeze(2)
+            penalty = (every.logsumexp(dim=2) - q).mean(dim=1).sum()
+        else:
+            q = action_value(self.critic, context, batch.action, self.spaces.choices)
+            if uniform is not None:
+                penalty = conservative_penalty(self.critic, context, uniform, q)
         loss = bellman_loss(q, target, self.config.huber)
         metrics = {"bellman_loss": loss.detach(), "q": q.detach().mean(), "target_q": target.mean()}
-        if penalised is not None:
-            density = None if self.config.cql_samples > 0 else torch.zeros_like(batch.reward)  # no integral over w
-            penalty = conservative_penalty(self.critic, context, penalised, q, density)
+        if penalty is not None:
             loss = loss + self.config.cql_weight * penalty
             metrics["cql_penalty"] = penalty.detach()
         return loss, metrics | {"critic_loss": loss.detach()}
@@ -235,15 +242,15 @@ class DiffusionSac(Agent):
         continuous, steps = self.spaces.continuous, config.diffusion.steps
         size = continuous + self.spaces.choices
         chain = ChainNoise.draw(count, size, steps, generator)
-        penalised = batch.action.continuous if config.cql_weight > 0 else None
+        uniform = None
         if config.cql_weight > 0 and config.cql_samples > 0:
             shape = (count * config.cql_samples, continuous)
-            penalised = 2.0 * torch.rand(shape, generator=generator, device=device) - 1.0
+            uniform = 2.0 * torch.rand(shape, generator=generator, device=device) - 1.0
         jitter: tuple[Tensor, Tensor] | tuple[None, None] = (None, None)
         if config.action_noise > 0:
             first, second = torch.randn((2, count, continuous), generator=generator, device=device)
             jitter = (first, second)
-        loss, metrics = self.critic_loss(batch, chain, penalised, jitter[0])
+        loss, metrics = self.critic_loss(batch, chain, uniform, jitter[0])
         clip = config.gradient_clip
         metrics["critic_gradient"] = minimise(loss, self.critic, self.optimisers["critic"], clip)
 

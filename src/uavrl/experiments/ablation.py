@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -38,8 +38,7 @@ BANDIT = DiffusionSacConfig(
     greedy_choice=False,
     action_noise=0.0,
 )
-FLIGHT = preset("diffusion_sac", "default")
-assert isinstance(FLIGHT, DiffusionSacConfig)  # noqa: S101  # for the type checker
+FLIGHT = cast(DiffusionSacConfig, preset("diffusion_sac", "default"))
 BASES = {"bandit": BANDIT, "fixed": FLIGHT}
 UPDATES = {"bandit": 2_500, "fixed": 2_000}
 
@@ -73,6 +72,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "discount .99": {"discount": 0.99},
     "no conservative penalty": {"cql_weight": 0.0},
     "conservative penalty .3": {"cql_weight": 0.3},
+    "Bellman error linear from 1 on": {"huber": 1.0},
 }
 CANDIDATES = (10, 50)  # of the base policy, beside its single one: nothing is trained anew for them
 
