@@ -62,12 +62,12 @@ def test_the_table_has_a_line_a_variant_and_one_for_each_number_of_candidates() 
     rows = [
         {"variant": "base", "scores": {"a": 0.5, "a@10": 0.75}},
         {"variant": "base", "scores": {"a": 0.25, "a@10": 1.0}},
-        {"variant": "other", "scores": {"a": 1.0}},
+        {"variant": "mean |Q|", "scores": {"a": 1.0}},
     ]
     assert table(rows).splitlines()[2:] == [
         "| base | 2 | 0.500, 0.250 |",
         "| 10 candidates | 2 | 0.750, 1.000 |",
-        "| other | 1 | 1.000 |",
+        r"| mean \|Q\| | 1 | 1.000 |",
     ]
 
 

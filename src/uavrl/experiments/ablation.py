@@ -159,7 +159,8 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     text = [f"| variant | seeds | {' | '.join(columns)} |", "|---" * (2 + len(columns)) + "|"]
     for variant, scores in lines.items():
         cells = [summary(np.array(scores[column])) if column in scores else "" for column in columns]
-        text.append(f"| {variant} | {max(map(len, scores.values()))} | {' | '.join(cells)} |")
+        name = variant.replace("|", r"\|")  # as in |Q|
+        text.append(f"| {name} | {max(map(len, scores.values()))} | {' | '.join(cells)} |")
     return "\n".join(text) + "\n"
 
 
