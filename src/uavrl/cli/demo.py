@@ -122,6 +122,15 @@ def _fly_heuristic(name: str, environments: EvaluationSet) -> Flights:
     return fly(make_policy(name), environments, name=name)
 
 
+def typical_flight(flights: Flights) -> int:
+    """The flight that ends as far from its start as the median one; of an even number, the farther of the middle two."""
+    import numpy as np
+
+    ends = flights.position_m[flights.steps, np.arange(len(flights.steps))]
+    order = np.argsort(np.linalg.norm(ends - flights.position_m[0], axis=1), kind="stable")
+    return int(order[len(order) // 2])
+
+
 def _write(out: Path, judgement: Judgement) -> None:
     """summary.json, the table, three figures and the page of a flight."""
     from uavrl.evaluation.report import markdown_table, write_json, write_text
@@ -134,8 +143,10 @@ def _write(out: Path, judgement: Judgement) -> None:
     training_curves(logs, out / "training.png")
     age_bars(judgement.report, out / "age.png")
     objective_bars(judgement.report, out / "return.png")
-    learned = judgement.flights["diffusion_sac"].episode(0)
-    trajectories([learned, judgement.flights["planner"].episode(0)], out / "trajectory.png")
+    planned = judgement.flights["planner"]
+    shown = typical_flight(planned)
+    learned = judgement.flights["diffusion_sac"].episode(shown)
+    trajectories([learned, planned.episode(shown)], out / "trajectory.png")
     hero(learned, out / "flight.png")
     write_page(learned, out / "flight.html")
 
