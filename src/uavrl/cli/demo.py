@@ -123,7 +123,7 @@ def _fly_heuristic(name: str, environments: EvaluationSet) -> Flights:
 
 
 def typical_flight(flights: Flights) -> int:
-    """The flight that ends as far from its start as the median one; of an even number, the farther of the middle two."""
+    """The flight that ends as far from its start as the median one; of an even number, the farther middle one."""
     import numpy as np
 
     ends = flights.position_m[flights.steps, np.arange(len(flights.steps))]
