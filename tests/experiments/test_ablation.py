@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -56,6 +58,15 @@ def test_flights_are_measured_by_either_action(monkeypatch: pytest.MonkeyPatch) 
     assert set(scores) == {"return_deterministic", "return_sampled", "return_sampled@2"}
     assert all(-100 < value < 0 for value in scores.values())
     assert len(set(scores.values())) == 3
+
+
+def test_returns_are_filed_under_the_action_that_flew_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fly(policy: object, flights: object, *, deterministic: bool) -> SimpleNamespace:
+        return SimpleNamespace(reward=np.full((3, 2), -1.0 if deterministic else -2.0), active=np.ones((3, 2)))
+
+    monkeypatch.setattr(ablation, "fly", fly)
+    (run,) = runs("fixed", (0,), ("no action noise",))
+    assert measure(small(run)) == {"return_deterministic": -3.0, "return_sampled": -6.0}
 
 
 def test_the_table_has_a_line_a_variant_and_one_for_each_number_of_candidates() -> None:

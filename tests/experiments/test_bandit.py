@@ -43,3 +43,10 @@ def test_a_clone_learns_each_choice_with_its_own_displacement() -> None:
     action = samples(agent, 1)
     assert float(((action.continuous - bandit.modes[action.choice]).norm(dim=1) < 0.3).float().mean()) > 0.9
     assert len(action.choice.unique()) == CHOICES
+
+
+def test_every_episode_ends_after_its_one_step_and_rewards_are_shifted() -> None:
+    bandit = HybridBandit.draw(0)
+    batch = bandit.batch(2.0)
+    assert bool((batch.terminated == 1.0).all())
+    torch.testing.assert_close(batch.reward, bandit.reward - 2.0)
