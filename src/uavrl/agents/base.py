@@ -130,6 +130,7 @@ def move_towards(target: nn.Module, source: nn.Module, rate: float) -> None:
         mine.copy_(theirs)
 
 
-def adam(parameters: Iterable[Tensor], learning_rate: float, weight_decay: float = 0.0) -> torch.optim.Optimizer:
-    """The optimiser of everything that is trained, fused; weight decay is the decoupled one."""
-    return torch.optim.AdamW(parameters, lr=learning_rate, weight_decay=weight_decay, fused=True)
+def adam(parameters: Iterable[Tensor], config: AgentConfig, *, decays: bool = True) -> torch.optim.Optimizer:
+    """The optimiser of everything that is trained, fused; `decays`: by the config's decoupled weight decay."""
+    weight_decay = config.weight_decay if decays else 0.0
+    return torch.optim.AdamW(parameters, lr=config.learning_rate, weight_decay=weight_decay, fused=True)

@@ -34,7 +34,7 @@ class BehaviourCloning(Agent):
         self.spaces, self.config = spaces, config
         self.actor = DiffusionActor(spaces, config.network, config.diffusion)
         self.networks = nn.ModuleDict({"actor": self.actor})
-        self.optimisers = {"actor": adam(self.actor.denoiser.parameters(), config.learning_rate, config.weight_decay)}
+        self.optimisers = {"actor": adam(self.actor.denoiser.parameters(), config)}
 
     def actor_loss(self, batch: Batch, step: Tensor, noise: Tensor) -> tuple[Tensor, Metrics]:
         """Eq. (diffRL_loss); step (B,) in 1..M, noise (B, C + D)."""

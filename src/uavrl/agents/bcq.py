@@ -89,9 +89,7 @@ class Bcq(Agent):
             "critic": self.critic,
         }
         self.networks = nn.ModuleDict(trained | {"actor_target": self.actor_target, "target": self.target})
-        self.optimisers = {
-            name: adam(one.parameters(), config.learning_rate, config.weight_decay) for name, one in trained.items()
-        }
+        self.optimisers = {name: adam(one.parameters(), config) for name, one in trained.items()}
 
     def classifier_loss(self, batch: Batch) -> tuple[Tensor, Metrics]:
         """Cross-entropy of the data's choices under G."""

@@ -149,9 +149,9 @@ class Cql(Agent):
             {"actor": self.actor, "critic": self.critic, "target": self.target, "temperature": temperature}
         )
         self.optimisers = {
-            "actor": adam(self.actor.parameters(), config.learning_rate, config.weight_decay),
-            "critic": adam(self.critic.parameters(), config.learning_rate, config.weight_decay),
-            "temperature": adam([self.log_temperature], config.learning_rate),
+            "actor": adam(self.actor.parameters(), config),
+            "critic": adam(self.critic.parameters(), config),
+            "temperature": adam([self.log_temperature], config, decays=False),
         }
 
     def critic_loss(self, batch: Batch, following: Tensor, penalty: PenaltyNoise | None) -> tuple[Tensor, Metrics]:

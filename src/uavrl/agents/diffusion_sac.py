@@ -132,8 +132,8 @@ class DiffusionSac(Agent):
         self.target = deepcopy(self.critic).requires_grad_(False)
         self.networks = nn.ModuleDict({"actor": self.actor, "critic": self.critic, "target": self.target})
         self.optimisers = {
-            "actor": adam(self.actor.denoiser.parameters(), config.learning_rate, config.weight_decay),
-            "critic": adam(self.critic.parameters(), config.learning_rate, config.weight_decay),
+            "actor": adam(self.actor.denoiser.parameters(), config),
+            "critic": adam(self.critic.parameters(), config),
         }
 
     def critic_loss(

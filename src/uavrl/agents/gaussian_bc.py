@@ -34,7 +34,7 @@ class GaussianBehaviourCloning(Agent):
         self.spaces, self.config = spaces, config
         self.actor = make_choice_actor(spaces, config.network)
         self.networks = nn.ModuleDict({"actor": self.actor})
-        self.optimisers = {"actor": adam(self.actor.parameters(), config.learning_rate, config.weight_decay)}
+        self.optimisers = {"actor": adam(self.actor.parameters(), config)}
 
     def actor_loss(self, batch: Batch) -> tuple[Tensor, Metrics]:
         """Negative log likelihood; there is no noise in it."""

@@ -61,10 +61,7 @@ class Iql(Agent):
             {"actor": self.actor, "value": self.value, "critic": self.critic, "target": self.target}
         )
         trained = {"actor": self.actor, "value": self.value, "critic": self.critic}
-        self.optimisers = {
-            name: adam(network.parameters(), config.learning_rate, config.weight_decay)
-            for name, network in trained.items()
-        }
+        self.optimisers = {name: adam(network.parameters(), config) for name, network in trained.items()}
 
     def state_value(self, observation: Observation) -> Tensor:
         """V(s), (B,)."""

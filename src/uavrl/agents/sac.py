@@ -151,9 +151,9 @@ class Sac(Agent):
             }
         )
         self.optimisers = {
-            "actor": adam(self.actor.parameters(), config.learning_rate, config.weight_decay),
-            "critic": adam(self.critic.parameters(), config.learning_rate, config.weight_decay),
-            "temperature": adam([self.log_temperature], config.learning_rate),
+            "actor": adam(self.actor.parameters(), config),
+            "critic": adam(self.critic.parameters(), config),
+            "temperature": adam([self.log_temperature], config, decays=False),
         }
 
     def critic_loss(self, batch: Batch, noise: Tensor) -> tuple[Tensor, Metrics]:
