@@ -16,15 +16,15 @@ import torch
 
 from uavrl.agents.diffusion_sac import DiffusionSac
 from uavrl.evaluation.rollouts import Flights, evaluation_set, fly
+from uavrl.experiments.ablation import TRIAL_SEED
 from uavrl.policies import make_policy
 from uavrl.policies.base import Policy
 from uavrl.scenario import load_scenario
-from uavrl.simulation.observations import devices_observation
+from uavrl.simulation.environment import observe
 from uavrl.simulation.state import FlightAction
 from uavrl.training.batches import to_tensors
 from uavrl.training.policy import AgentPolicy, load_policy, trained_scenario
 
-TRIAL_SEED = 500_000
 LAYOUTS, FADINGS = 100, 3
 STUCK = 0.2  # of the steps after the first hundred
 
@@ -45,16 +45,12 @@ class Swapped:
 
     def act(self, observation: Any, *, generator: np.random.Generator, deterministic: bool = False) -> FlightAction:
         """One part of each."""
-        state = observation.state
-        seen = devices_observation(
-            observation.scenario, observation.layout_m, state.position_m, state.age_s, state.energy_j, state.used_j
-        )
-        arrays = {name: np.asarray(value, dtype=np.float32) for name, value in seen._asdict().items()}
+        seen = observe("devices", observation.scenario, observation.layout_m, observation.state)
         known = self.hover.act(observation, generator=generator, deterministic=True)
         if self.moves == "own":
-            own = self.learned.act(arrays, generator=generator, deterministic=True)
+            own = self.learned.act(seen, generator=generator, deterministic=True)
             return FlightAction(own.displacement_m, known.device)
-        tensors = to_tensors(arrays)
+        tensors = to_tensors(seen)
         w = torch.from_numpy(np.asarray(known.displacement_m) / self.learned.reach_m).float()
         with torch.no_grad():
             q = self.agent.critic.all_choices(self.agent.critic.encode(tensors), w).amin(dim=0)
