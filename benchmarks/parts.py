@@ -1,8 +1,9 @@
 """Whose part is the excess: a critic's policy with the hover heuristic's moves, and with its choice of device.
 
-    python -m benchmarks.parts runs/layouts [MORE ...]
+    python -m benchmarks.parts [--planner] runs/layouts [MORE ...]
 
-On trial flights of preset `released`, which no evaluation uses. The table in docs/what-matters.md is made of such.
+The planner's line takes minutes. On trial flights of preset `released`, which no evaluation uses. The tables in
+docs/what-matters.md are made of such.
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ from uavrl.training.batches import to_tensors
 from uavrl.training.policy import AgentPolicy, load_policy, trained_scenario
 
 LAYOUTS, FADINGS = 100, 3
-STUCK = 0.2  # of the steps after the first hundred
+EARLY = 50
+LATER = 100
+STUCK = 0.2  # share of the steps after the first LATER
 
 
 class Swapped:
@@ -58,15 +61,16 @@ class Swapped:
 
 
 def line(name: str, flights: Flights) -> str:
-    """Returns, idling, and whether it ends in idling."""
-    returns = (flights.reward * flights.active).sum(axis=0)
-    of_layout = returns.reshape(LAYOUTS, FADINGS).mean(axis=1)
+    """Returns, what the first steps cost of them, idling, and whether it ends in idling."""
+    reward = flights.reward * flights.active
+    returns, start = reward.sum(axis=0), reward[:EARLY].sum(axis=0).mean()
+    of_layout = returns.reshape(-1, FADINGS).mean(axis=1)
     half = 1.96 * of_layout.std(ddof=1) / len(of_layout) ** 0.5
     idle = (flights.device == 0) & flights.active
-    early, late = idle[:100].mean(), idle[100:].mean()
-    stuck = (idle[100:].mean(axis=0) > STUCK).mean()
+    early, late = idle[:LATER].mean(), idle[LATER:].mean()
+    stuck = (idle[LATER:].mean(axis=0) > STUCK).mean()
     return (
-        f"| {name} | {returns.mean():.0f} ± {half:.0f} | {np.median(returns):.0f} | {100 * early:.1f} | "
+        f"| {name} | {returns.mean():.0f} ± {half:.0f} | {np.median(returns):.0f} | {start:.0f} | {100 * early:.1f} | "
         f"{100 * late:.1f} | {100 * stuck:.0f} |"
     )
 
@@ -76,10 +80,13 @@ def main(paths: list[str]) -> None:
     torch.set_num_threads(1)
     scenario = load_scenario("released")
     trial = evaluation_set(scenario, "random", LAYOUTS, seed=TRIAL_SEED, fading_seeds=FADINGS)
-    print("| policy | return | median | idle, first 100 steps, % | idle after, % | flights that idle on, % |")
-    print("|---|---|---|---|---|---|")
-    print(line("hover", fly(make_policy("hover"), trial)))
-    for path in paths:
+    columns = ("policy", "return", "median", f"steps 1-{EARLY}", f"idle, first {LATER} steps, %", "idle after, %")
+    print(f"| {' | '.join(columns)} | flights that idle on, % |")
+    print("|---" * 7 + "|")
+    known = ["hover", "planner"] if "--planner" in paths else ["hover"]
+    for name in known:
+        print(line(name, fly(make_policy(name), trial)), flush=True)
+    for path in (path for path in paths if path != "--planner"):
         policy = load_policy(Path(path), scenario)
         agent = policy.agent
         if not isinstance(agent, DiffusionSac) or policy.needs != "devices" or trained_scenario(Path(path)) != scenario:

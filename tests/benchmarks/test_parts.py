@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks import parts
+from uavrl.agents.diffusion_sac import DiffusionSac, DiffusionSacConfig
+from uavrl.evaluation.rollouts import evaluation_set, fly
+from uavrl.networks import NetworkConfig
+from uavrl.policies import make_policy
+from uavrl.scenario import load_scenario
+from uavrl.training.batches import spaces_of
+from uavrl.training.policy import AgentPolicy
+
+SCENARIO = load_scenario("released", max_steps=12)
+
+
+@pytest.fixture
+def learned() -> AgentPolicy:
+    torch.manual_seed(0)
+    config = DiffusionSacConfig(network=NetworkConfig(kind="devices", width=8))
+    return AgentPolicy("untrained", DiffusionSac(spaces_of(SCENARIO, "devices"), config), SCENARIO)
+
+
+def test_one_part_is_lent_and_the_other_kept(learned: AgentPolicy) -> None:
+    agent = cast(DiffusionSac, learned.agent)
+    trial = evaluation_set(SCENARIO, "random", 6, seed=3)
+    hover, own = fly(make_policy("hover"), trial), fly(learned, trial, deterministic=True)
+    moved = fly(parts.Swapped(learned, agent, "hover's"), trial)
+    served = fly(parts.Swapped(learned, agent, "own"), trial)
+    np.testing.assert_array_equal(moved.position_m, hover.position_m)
+    np.testing.assert_array_equal(served.position_m[1], own.position_m[1])  # ages, and so moves, differ from there on
+    assert (moved.device != hover.device).any()
+    assert (served.position_m[1] != hover.position_m[1]).any()
+    np.testing.assert_array_equal(served.device[0], hover.device[0])
+
+
+def test_a_line_counts_flown_steps_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parts, "FADINGS", 1)
+    steps, flights = 120, 2
+    device = np.ones((steps, flights), dtype=int)
+    device[:10, 0] = 0  # 5 % of the first hundred steps of both
+    device[100:105, 1] = 0  # a quarter of flight 1's later steps
+    active = np.ones((steps, flights), dtype=bool)
+    active[110:] = False
+    reward = np.full((steps, flights), -1.0)
+    reward[:, 1] = -2.0
+    made: Any = SimpleNamespace(reward=reward, active=active, device=device)
+    # returns -110 and -220, +-1.96 * 77.8 / sqrt 2; the first fifty steps -50 and -100
+    assert parts.line("made", made) == "| made | -165 \u00b1 108 | -165 | -75 | 5.0 | 12.5 | 50 |"
