@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from uavrl.agents.diffusion_sac import DiffusionSac
 from uavrl.evaluation.rollouts import Flights, evaluation_set, fly
@@ -37,27 +38,32 @@ class Swapped:
 
     needs: Literal["paper", "devices", "state"] = "state"
 
-    def __init__(self, learned: AgentPolicy, agent: DiffusionSac, moves: Literal["own", "hover's"]) -> None:
-        self.learned, self.agent, self.moves, self.name = learned, agent, moves, f"{moves} moves"
+    def __init__(self, policy: AgentPolicy, moves: Literal["own", "hover's"]) -> None:
+        self.policy, self.moves, self.name = policy, moves, f"{moves} moves"
         self.hover: Policy = make_policy("hover")
 
     def reset(self, count: int) -> None:
         """Of both parts."""
         self.hover.reset(count)
-        self.learned.reset(count)
+        self.policy.reset(count)
 
     def act(self, observation: Any, *, generator: np.random.Generator, deterministic: bool = False) -> FlightAction:
         """One part of each."""
         seen = observe("devices", observation.scenario, observation.layout_m, observation.state)
         known = self.hover.act(observation, generator=generator, deterministic=True)
         if self.moves == "own":
-            own = self.learned.act(seen, generator=generator, deterministic=True)
+            own = self.policy.act(seen, generator=generator, deterministic=True)
             return FlightAction(own.displacement_m, known.device)
-        tensors = to_tensors(seen)
-        w = torch.from_numpy(np.asarray(known.displacement_m) / self.learned.reach_m).float()
-        with torch.no_grad():
-            q = self.agent.critic.all_choices(self.agent.critic.encode(tensors), w).amin(dim=0)
-        return FlightAction(known.displacement_m, q.argmax(dim=-1).numpy())
+        return FlightAction(known.displacement_m, best_device(self.policy, seen, known.displacement_m)[0])
+
+
+def best_device(policy: AgentPolicy, seen: Any, displacement_m: NDArray[np.float64]) -> tuple[Any, Any]:
+    """(device, min Q), each (N,): what the critic would choose beside given moves (N, 2), and what it thinks of it."""
+    critic = cast(DiffusionSac, policy.agent).critic
+    w = torch.from_numpy(displacement_m / policy.reach_m).float()
+    with torch.no_grad():
+        best = critic.all_choices(critic.encode(to_tensors(seen)), w).amin(dim=0).max(dim=-1)
+    return best.indices.numpy(), best.values.numpy()
 
 
 def line(name: str, flights: Flights) -> str:
@@ -75,6 +81,16 @@ def line(name: str, flights: Flights) -> str:
     )
 
 
+def learned(path: Path) -> AgentPolicy:
+    """A checkpoint's policy, whose critic knows every choice; stops where it is another."""
+    scenario = load_scenario("released")
+    policy = load_policy(path, scenario)
+    known = isinstance(policy.agent, DiffusionSac) and policy.needs == "devices"
+    if not known or trained_scenario(path) != scenario:
+        sys.exit(f"{path}: allowed here: Diffusion-SAC with a set network, trained in preset 'released'")
+    return policy
+
+
 def main(paths: list[str]) -> None:
     """Print the table."""
     torch.set_num_threads(1)
@@ -87,13 +103,10 @@ def main(paths: list[str]) -> None:
     for name in known:
         print(line(name, fly(make_policy(name), trial)), flush=True)
     for path in (path for path in paths if path != "--planner"):
-        policy = load_policy(Path(path), scenario)
-        agent = policy.agent
-        if not isinstance(agent, DiffusionSac) or policy.needs != "devices" or trained_scenario(Path(path)) != scenario:
-            sys.exit(f"{path}: allowed here: Diffusion-SAC with a set network, trained in preset 'released'")
+        policy = learned(Path(path))
         print(line(path, fly(policy, trial, deterministic=True)))
-        print(line("- hover's moves, its devices", fly(Swapped(policy, agent, "hover's"), trial)))
-        print(line("- its moves, hover's devices", fly(Swapped(policy, agent, "own"), trial)), flush=True)
+        print(line("- hover's moves, its devices", fly(Swapped(policy, "hover's"), trial)))
+        print(line("- its moves, hover's devices", fly(Swapped(policy, "own"), trial)), flush=True)
 
 
 if __name__ == "__main__":

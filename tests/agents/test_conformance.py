@@ -303,6 +303,8 @@ def test_an_unknown_preset_is_refused(name: str, which: str) -> None:
     "changes",
     [
         {"gradient": "last_k", "gradient_steps": 6},
+        {"final_action_noise": 0.2, "action_noise": 0.1},
+        {"final_action_noise": 0.0},
         {"guidance": "softmax"},
         {"bc_weight": 1.1},
         {"cql_weight": -0.1},

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,11 +27,10 @@ def learned() -> AgentPolicy:
 
 
 def test_one_part_is_lent_and_the_other_kept(learned: AgentPolicy) -> None:
-    agent = cast(DiffusionSac, learned.agent)
     trial = evaluation_set(SCENARIO, "random", 6, seed=3)
     hover, own = fly(make_policy("hover"), trial), fly(learned, trial, deterministic=True)
-    moved = fly(parts.Swapped(learned, agent, "hover's"), trial)
-    served = fly(parts.Swapped(learned, agent, "own"), trial)
+    moved = fly(parts.Swapped(learned, "hover's"), trial)
+    served = fly(parts.Swapped(learned, "own"), trial)
     np.testing.assert_array_equal(moved.position_m, hover.position_m)
     np.testing.assert_array_equal(served.position_m[1], own.position_m[1])  # ages, and so moves, differ from there on
     assert (moved.device != hover.device).any()

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import pytest
 import torch
 
 from tests.agents.problems import agent, batch, copies, equal
@@ -30,6 +31,7 @@ def test_fit_sets_the_normalisers_and_updates_so_many_times_on_minibatches() -> 
     assert equal(copies(straight.networks), copies(fitted.networks))
     assert metrics == {name: float(value) for name, value in last.items()}
     assert fit(fitted, data, 0, generator()) == {}
+    assert fitted.progress == pytest.approx(2 / 3)
 
 
 def test_minibatches_come_from_the_generator_and_reach_every_row() -> None:

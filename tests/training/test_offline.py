@@ -12,6 +12,7 @@ import torch
 from tests.agents.problems import CONFIGS, copies, equal, network
 from tests.datasets.flights import fly, small_scenario
 from uavrl.actions import HybridAction
+from uavrl.agents.base import Batch, Metrics
 from uavrl.agents.bc import BcConfig
 from uavrl.agents.diffusion_actor import DiffusionConfig
 from uavrl.agents.diffusion_sac import DiffusionSacConfig
@@ -117,6 +118,30 @@ def test_the_learning_rate_falls_on_a_cosine_and_the_log_has_every_row(tmp_path:
     np.testing.assert_allclose(rates, expected, rtol=1e-6)
     assert [row["step"] for row in rows(tmp_path)] == [2, 4, 6, 8, 10, 12]
     assert {"q", "bc_loss", "guided_q", "critic_gradient", "actor_gradient"} <= set(rows(tmp_path)[0])
+
+
+def test_an_agent_knows_how_much_of_its_training_is_done_also_after_a_stop(tmp_path: Path, flown: Transitions) -> None:
+    def knows(learner: OfflineLearner) -> list[float]:
+        told: list[float] = []
+        update = learner.agent.update
+
+        def spy(batch: Batch, generator: torch.Generator) -> Metrics:
+            told.append(learner.agent.progress)
+            return update(batch, generator)
+
+        learner.agent.update = spy  # type: ignore[method-assign]  # a spy
+        return told
+
+    learner = OfflineLearner(config(), flown)
+    told = knows(learner)
+    with pytest.raises(KeyboardInterrupt):
+        learner.run(tmp_path, interrupt_at(7))
+    resumed = OfflineLearner.resume(tmp_path, flown)
+    assert resumed is not None
+    then = knows(resumed)
+    resumed.run(tmp_path, quiet)
+    assert len(told) < 12
+    np.testing.assert_allclose(told + then, np.arange(12) / 12)
 
 
 def test_what_an_update_sees_is_a_row_of_the_data_as_a_whole(flown: Transitions) -> None:

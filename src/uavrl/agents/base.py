@@ -79,6 +79,7 @@ class Agent(ABC):
     networks: nn.ModuleDict  # everything that is saved, targets and averages included
     optimisers: dict[str, torch.optim.Optimizer]
     acts_best_deterministically = False  # whether a trial should fly its deterministic action rather than a sample
+    progress = 0.0  # share of the training that is done; a loop that knows its length sets it before an update
 
     @abstractmethod
     def update(self, batch: Batch, generator: torch.Generator) -> Metrics:

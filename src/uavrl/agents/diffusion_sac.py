@@ -66,6 +66,12 @@ class DiffusionSacConfig(AgentConfig):
         description="standard deviation of noise on w where Q is asked, in the backup and in L_g (target policy "
         "smoothing, Fujimoto et al. 2018): a move costs its length, a cone whose tip would hold w at 0. Paper: 0",
     )
+    final_action_noise: float | None = Field(
+        None,
+        gt=0,
+        description="where action_noise ends, falling geometrically over a training: wide first, so that a drift pays; "
+        "then narrow, since wide noise also makes a slow flight the best one; none: constant",
+    )
     pinned_level: bool = Field(
         False,
         description="subtract the batch's mean from Q' in the backup (as relative value iteration does): differences "
@@ -109,6 +115,10 @@ class DiffusionSacConfig(AgentConfig):
         if self.guidance == "softmax" and (self.network.kind != "mlp" or self.network.choice_heads):
             raise ValueError(
                 "guidance = 'softmax' needs a critic with the choice as input: kind 'mlp', choice_heads false"
+            )
+        if self.final_action_noise is not None and self.final_action_noise > self.action_noise:
+            raise ValueError(
+                f"final_action_noise = {self.final_action_noise} must be <= action_noise = {self.action_noise}"
             )
         return self
 
@@ -278,9 +288,14 @@ class DiffusionSac(Agent):
         best = q.view(rows, count).argmax(dim=1) + count * torch.arange(rows, device=q.device)
         return HybridAction(drawn.continuous[best], choice[best])
 
+    def action_noise(self) -> float:
+        """Standard deviation now, at this share of the training."""
+        first, last = self.config.action_noise, self.config.final_action_noise
+        return first if last is None else float(first * (last / first) ** self.progress)
+
     def _jittered(self, w: Tensor, jitter: Tensor | None) -> Tensor:
         """w (B, C) with action noise, in the box; its gradient leads back into the box, not out of it."""
-        return w if jitter is None else straight_through_clamp(w + self.config.action_noise * jitter)
+        return w if jitter is None else straight_through_clamp(w + self.action_noise() * jitter)
 
     def _best(self, critic: Critic, context: Context, action: HybridAction) -> tuple[Tensor, Tensor]:
         """(min Q, choice), each (B,), of w with its own choice, or with the best one where the config says so."""

@@ -66,6 +66,7 @@ def fit_bandit(agent: Agent, bandit: HybridBandit, updates: int, seed: int) -> N
     generator = torch.Generator().manual_seed(seed)
     data = bandit.batch(float(bandit.reward.median()) if agent.config.reward.transform == "centred" else 0.0)
     for update in range(updates):
+        agent.progress = update / updates
         for optimiser in agent.optimisers.values():
             for group in optimiser.param_groups:
                 group["lr"] = agent.config.learning_rate * 0.5 * (1 + math.cos(math.pi * update / updates))

@@ -49,6 +49,7 @@ def fit(agent: Agent, data: Batch, updates: int, generator: torch.Generator) -> 
     """
     fit_normalisers(agent.networks, data.observation)
     metrics: Metrics = {}
-    for _ in range(updates):
+    for done in range(updates):
+        agent.progress = done / updates
         metrics = learn_once(agent, data, generator)
     return {name: float(value) for name, value in metrics.items()}

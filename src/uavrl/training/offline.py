@@ -143,6 +143,7 @@ class OfflineLearner:
         for optimiser in self.agent.optimisers.values():
             for group in optimiser.param_groups:
                 group["lr"] = rate
+        self.agent.progress = self.updates / self.config.updates
         metrics = learn_once(self.agent, self.data, self.generator)
         self.updates += 1
         return metrics

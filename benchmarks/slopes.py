@@ -1,0 +1,102 @@
+"""What a metre costs and what it buys: the critic's answer beside the flights' own (Monte Carlo).
+
+    python -m benchmarks.slopes runs/layouts [MORE ...]
+
+At one step of each trial flight the aircraft holds, or flies a whole step towards the hover heuristic's point, or away
+from it; then the policy goes on under the same draws. Half of towards less away, a metre, is what a metre nearer is
+worth; hold less the mean of both is what a metre costs. Returns are plain sums to the flight's end, Q is discounted.
+Flights within `NEAR_M` of the point count as arrived and are left out, and so are those in which one draw decides.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from benchmarks.parts import LAYOUTS, best_device, learned
+from uavrl.evaluation.rollouts import EvaluationSet, evaluation_set, fly
+from uavrl.experiments.ablation import TRIAL_SEED
+from uavrl.policies import make_policy
+from uavrl.scenario import load_scenario
+from uavrl.simulation.state import FlightAction
+from uavrl.training.policy import AgentPolicy
+
+Float = NDArray[np.float64]
+
+FADINGS = 6
+STEPS = (30, 60)
+NEAR_M = 200.0
+RARE = 60.0  # a return that one move changes by more than this was decided by another draw of the fading
+MOVES = {"hold": 0.0, "towards": 1.0, "away": -1.0}
+
+
+class Moved:
+    """A policy, but for one step, in which it makes the given move with the critic's best device for it."""
+
+    needs: Literal["paper", "devices", "state"] = "devices"
+    name = "moved"
+
+    def __init__(self, policy: AgentPolicy, step: int, displacement_m: Float) -> None:
+        self.policy, self.step, self.displacement_m = policy, step, displacement_m
+        self.count, self.q = 0, np.zeros(0)
+
+    def reset(self, count: int) -> None:
+        """Of the policy, and of the step."""
+        self.policy.reset(count)
+        self.count = 0
+
+    def act(self, observation: Any, *, generator: np.random.Generator, deterministic: bool = False) -> FlightAction:
+        """The policy's action, or the move."""
+        own = self.policy.act(observation, generator=generator, deterministic=True)
+        self.count += 1
+        if self.count - 1 != self.step or len(own.device) != len(self.displacement_m):
+            return own
+        device, self.q = best_device(self.policy, observation, self.displacement_m)
+        return FlightAction(self.displacement_m, device)
+
+
+def answers(policy: AgentPolicy, trial: EvaluationSet, step: int) -> tuple[Float, Float, Float]:
+    """Distance to go (n,) in metres, and what came of each of `MOVES`, (3, n), by flights and by the critic."""
+    point = fly(make_policy("hover"), trial).position_m[-1]
+    position = fly(policy, trial, deterministic=True).position_m[step]
+    distance = np.linalg.norm(point - position, axis=1)
+    heading = (point - position) / np.maximum(distance, 1e-9)[:, None]
+    flown, said = [], []
+    for sign in MOVES.values():
+        moved = Moved(policy, step, sign * policy.reach_m * heading)
+        flights = fly(moved, trial)
+        flown.append((flights.reward * flights.active)[step:].sum(axis=0))
+        said.append(moved.q)
+    return distance, np.array(flown), np.array(said, dtype=np.float64)
+
+
+def interval(values: Float) -> str:
+    """Mean and half of its normal 95 % interval."""
+    return f"{values.mean():.3f} ± {1.96 * values.std(ddof=1) / len(values) ** 0.5:.3f}"
+
+
+def main(paths: list[str]) -> None:
+    """Print the table."""
+    torch.set_num_threads(1)
+    trial = evaluation_set(load_scenario("released"), "random", LAYOUTS, seed=TRIAL_SEED, fading_seeds=FADINGS)
+    print("| policy | step | flights | a metre nearer, flown | by Q | a metre's cost, flown | by Q |")
+    print("|---" * 7 + "|")
+    for path in paths:
+        policy = learned(Path(path))
+        for step in STEPS:
+            distance, *found = answers(policy, trial, step)
+            kept = (distance > NEAR_M) & (np.abs(found[0] - found[0][0]).max(axis=0) < RARE)
+            cells = [str(step), str(kept.sum())]
+            hold, towards, away = np.moveaxis(np.array(found)[:, :, kept], 1, 0) / policy.reach_m
+            cells += [interval(one) for one in (towards - away) / 2]
+            cells += [interval(one) for one in hold - (towards + away) / 2]
+            print(f"| {path} | {cells[0]} | {' | '.join(cells[1:])} |", flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
