@@ -17,8 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from uavrl.agents.diffusion_sac import DiffusionSac
-from uavrl.evaluation.rollouts import Flights, evaluation_set, fly
-from uavrl.experiments.ablation import TRIAL_SEED
+from uavrl.evaluation.rollouts import TRIAL_SEED, Flights, evaluation_set, fly
 from uavrl.policies import make_policy
 from uavrl.policies.base import Policy
 from uavrl.scenario import load_scenario

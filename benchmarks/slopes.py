@@ -19,8 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.parts import LAYOUTS, best_device, learned
-from uavrl.evaluation.rollouts import EvaluationSet, evaluation_set, fly
-from uavrl.experiments.ablation import TRIAL_SEED
+from uavrl.evaluation.rollouts import TRIAL_SEED, EvaluationSet, evaluation_set, fly
 from uavrl.policies import make_policy
 from uavrl.scenario import load_scenario
 from uavrl.simulation.state import FlightAction

@@ -11,9 +11,9 @@ import pytest
 
 from tests.datasets.flights import fly, small_scenario
 from uavrl.cli import main
-from uavrl.cli.train import TRIAL_SEED, trial_flights
+from uavrl.cli.train import trial_flights
 from uavrl.datasets import save_flat
-from uavrl.evaluation.rollouts import EVALUATION_SEED, fixed_layout
+from uavrl.evaluation.rollouts import EVALUATION_SEED, TRIAL_SEED, fixed_layout
 from uavrl.training.checkpoint import load_checkpoint
 from uavrl.training.policy import load_policy
 

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 Many = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
 LOG_EVERY = 200  # updates between rows of the log, at most
-TRIAL_SEED = 500_000  # trial flights during training: neither the data's seeds nor the evaluation's
 
 
 @dataclass(frozen=True)
@@ -116,7 +115,7 @@ def trial_flights(transitions: Transitions, scenario: Scenario, episodes: int = 
     """Flies a policy on trial layouts: the data's own where they hold a single one, else new ones."""
     from dataclasses import replace
 
-    from uavrl.evaluation.rollouts import evaluation_set, fly
+    from uavrl.evaluation.rollouts import TRIAL_SEED, evaluation_set, fly
     from uavrl.training.policy import AgentPolicy
 
     environments = evaluation_set(scenario, "random", episodes, seed=TRIAL_SEED)

@@ -15,14 +15,13 @@ from scipy.stats import t
 from uavrl.agents.diffusion_sac import DiffusionSac, DiffusionSacConfig
 from uavrl.agents.registry import preset
 from uavrl.datasets import load_builtin
-from uavrl.evaluation.rollouts import evaluation_set, fly
+from uavrl.evaluation.rollouts import TRIAL_SEED, evaluation_set, fly
 from uavrl.experiments.bandit import SPACES, HybridBandit, fit_bandit, samples
 from uavrl.experiments.runner import Run
 from uavrl.networks import NetworkConfig
 from uavrl.scenario import load_scenario
 from uavrl.training.offline import OfflineLearner, TrainConfig
 
-TRIAL_SEED = 500_000  # flights for choosing settings: neither the data's seeds nor the evaluation's
 EPISODES = 50
 
 _BANDIT_NETWORK = NetworkConfig(kind="mlp", width=128, depth=3)
