@@ -30,9 +30,7 @@ Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 EVALUATION_SEED = 1_000_000  # training's seeds stay below
-TRIAL_SEED = (
-    500_000  # flights for choosing settings, during a training or after: neither the data's nor the evaluation's
-)
+TRIAL_SEED = 500_000  # flights for choosing settings: neither the data's seeds nor the evaluation's
 
 _BLOCK = 64  # steps whose draws are made at once
 _LATENCY_CALLS, _LATENCY_SECONDS = 50, 2.0
