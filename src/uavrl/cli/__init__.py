@@ -36,6 +36,10 @@ COMMANDS: dict[str, Command] = {
     "train": Command("uavrl.cli.train:Train", "learn a policy from logged flights alone"),
     "evaluate": Command("uavrl.cli.evaluate:Evaluate", "fly policies on equal layouts, starts and fading"),
     "ablate": Command("uavrl.cli.ablate:Ablate", "change one setting of Diffusion-SAC at a time and measure"),
+    "bench simulate": Command(
+        "uavrl.cli.bench:BenchSimulate", "measure environment steps a second, beside their floors"
+    ),
+    "bench train": Command("uavrl.cli.bench:BenchTrain", "measure updates a second, beside what the products allow"),
     "demo": Command("uavrl.cli.demo:Demo", "learn a small policy, judge it, and show it"),
     "watch": Command("uavrl.cli.watch:Watch", "make a web page of one flight of a policy"),
 }

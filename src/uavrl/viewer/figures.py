@@ -315,6 +315,33 @@ def _path(axes: Axes, episode: Episode, norm: Normalize | None = None) -> None:
     axes.plot(*position[-1], marker="X", markersize=10, color=colours[1], markeredgecolor=INK, mew=0.8, zorder=7)
 
 
+def step_times(rows: Sequence[Mapping[str, float]], out: Path) -> None:
+    """Seconds of a simulator's step over N and over K, with a line of slope 1 through the largest.
+
+    Args:
+        rows: of `uavrl.benchmarks.simulate.scaling`: "environments", "devices" and "step_s".
+        out: PNG file.
+
+    Raises:
+        ConfigError: `out` cannot be written.
+    """
+    figure = Figure(figsize=(8.0, 3.4), dpi=_DPI, layout="constrained")
+    panels = (("environments", "devices", "environments N"), ("devices", "environments", "devices K"))
+    for axes, (varied, kept, title) in zip(figure.subplots(1, 2), panels, strict=True):
+        values = [row[kept] for row in rows]
+        common = max(set(values), key=values.count)
+        points = sorted((row[varied], row["step_s"]) for row in rows if row[kept] == common)
+        x, y = np.array(points).T
+        axes.loglog(x, 1e3 * y, "o-", color=PALETTE[0], label="measured")
+        axes.loglog(x, 1e3 * y[-1] * x / x[-1], "--", color="#999999", label="proportional")
+        axes.set_xlabel(f"{title}, at {common:,.0f} {kept}")
+        axes.set_ylabel("one step (ms)")
+        axes.grid(color="#ececec", linewidth=0.6)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.legend(frameon=False)
+    _save(figure, out)
+
+
 def _save(figure: Figure, out: Path) -> None:
     try:
         figure.savefig(out, format="png", bbox_inches="tight", pad_inches=0.1)

@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from uavrl.benchmarks import simulate, train
+from uavrl.cli import main
+
+
+@pytest.fixture(autouse=True)
+def _threads() -> object:
+    """The command sets torch's threads for its own process."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+def test_simulation_is_measured_beside_its_floors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(simulate, "BATCH", 64)
+    monkeypatch.setattr(simulate, "SINGLE_ACTIONS", 4)
+    monkeypatch.setattr(simulate, "SCALED_ENVIRONMENTS", (1, 10))
+    monkeypatch.setattr(simulate, "SCALED_DEVICES", (1, 10))
+    file, plot = tmp_path / "a.json", tmp_path / "a.png"
+    assert main(["bench", "simulate", "--seconds", "0.02", "--json", str(file), "--plot", str(plot)]) == 0
+    found = json.loads(file.read_text())
+    for name in ("batch_steps", "single_steps"):
+        assert 0 < found[f"{name}_per_s"] < found[f"{name}_floor_per_s"]
+    sizes = [(row["environments"], row["devices"]) for row in found["scaling"]]
+    assert sizes == [(1, 10), (10, 10), (1000, 1), (1000, 10)]
+    assert found["machine"]["threads"] == 1
+    assert plot.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_training_is_measured_beside_its_products(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(train, "PRESETS", {"default": "layouts"})
+    file = tmp_path / "a.json"
+    assert main(["bench", "train", "--seconds", "0.02", "--json", str(file)]) == 0
+    found = json.loads(file.read_text())
+    assert 0 < found["default_updates_per_s"] < found["default_updates_floor_per_s"]
+    assert found["default_gflop_per_update"] == pytest.approx(1.24, abs=0.02)
+    assert "of it" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--seconds", "0"], "--seconds 0.0, allowed: 0.01 to 3600"),
+        (["--threads", "0"], "--threads 0, allowed: 1 or more"),
+        (["--json", "nowhere/a.json"], "nowhere/a.json"),
+    ],
+)
+def test_wrong_words_are_refused_in_one_line(
+    words: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["bench", "train", *words]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
