@@ -14,7 +14,7 @@ def next_age_s(age_s: Array, served: Array, duration_s: Array, max_age_s: float)
         duration_s: (N,) T_total.
     """
     xp = array_namespace(age_s)
-    return xp.where(served, 0.0, xp.minimum(age_s + duration_s[:, None], max_age_s))
+    return xp.minimum(age_s + duration_s[:, None], max_age_s) * ~served  # a product is faster than a choice here
 
 
 def age_integral_s2(age_s: Array, duration_s: Array, max_age_s: float) -> Array:

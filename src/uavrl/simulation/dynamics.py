@@ -35,14 +35,12 @@ def _fly(position_m: Array, displacement_m: Array, d_max: float, area: Area) -> 
 
 
 def _transmit(
-    scenario: Scenario, layout_m: Array, position_m: Array, device: Array, draws: Draws
+    scenario: Scenario, device_m: Array, position_m: Array, index: Array, draws: Draws
 ) -> tuple[Array, Array, Array]:
     """(snr, rate in bit/s, packet in bits) of the wanted link, (N,) or one number; idle rows mean nothing."""
     xp = array_namespace(position_m)
-    index = xp.maximum(device - 1, 0)
-    rows = xp.arange(index.shape[0], device=index.device)
     link = scenario.channel
-    elevation, los, snr = channel.link_snr(length(layout_m[rows, index] - position_m), link)
+    elevation, los, snr = channel.link_snr(length(device_m - position_m), link)
     if link.fading == "rayleigh":
         snr = snr * channel.rayleigh_power(draws.scatter)
     elif link.fading == "rician":
@@ -102,7 +100,11 @@ def advance(
     move_s = length(moved) / frame.speed_mps
 
     wants = action.device > 0
-    snr, rate, bits = _transmit(scenario, layout_m, position, action.device, draws)
+    # one flat index into N x K is looked up several times as fast as a pair of indices
+    index = xp.maximum(action.device - 1, 0)
+    place = xp.arange(index.shape[0], device=index.device) * layout_m.shape[1] + index
+    device_m = xp.take(layout_m.reshape((-1, 2)), place, axis=0)
+    snr, rate, bits = _transmit(scenario, device_m, position, index, draws)
     transmission_s = channel.transmission_s(bits, rate)
     limit_s = scenario.channel.max_transmission_s
     never = xp.zeros_like(wants)
@@ -123,9 +125,9 @@ def advance(
     idle_j = energy.idle_energy_j(idle_s, frame)
     total_j = move_j + communication_j + idle_j  # eq. (energy_total)
 
-    devices = xp.arange(1, layout_m.shape[1] + 1, dtype=action.device.dtype, device=action.device.device)
-    reset = xp.where(arrived, action.device, 0)[:, None] == devices
-    ages = age.next_age_s(state.age_s, reset, duration_s, traffic.max_age_s)
+    reset = xp.zeros((index.shape[0] * layout_m.shape[1],), dtype=xp.bool, device=index.device)
+    reset[place] = arrived
+    ages = age.next_age_s(state.age_s, reset.reshape(state.age_s.shape), duration_s, traffic.max_age_s)
     age_cost = age_term(scenario, state.age_s, ages, duration_s)
     energy_term = total_j / hover_reference_j(scenario, energy.hover_power_w(frame))
     reward = -(objective.age_weight * age_cost + (1.0 - objective.age_weight) * energy_term)  # eq. (reward)
