@@ -38,7 +38,7 @@ __all__ = ["PRESET_UPDATES", "Evaluator", "OfflineLearner", "TrainConfig", "take
 Evaluator = Callable[[AgentPolicy], dict[str, float]]
 
 # The paper: J = 150 passes over 30 k rows in batches of 64
-PRESET_UPDATES = {"default": 30_000, "paper": 70_000}
+PRESET_UPDATES = {"default": 12_000, "paper": 70_000}
 
 
 class TrainConfig(BaseModel):
