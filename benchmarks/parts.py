@@ -72,8 +72,8 @@ def line(name: str, flights: Flights) -> str:
     of_layout = returns.reshape(-1, FADINGS).mean(axis=1)
     half = 1.96 * of_layout.std(ddof=1) / len(of_layout) ** 0.5
     idle = (flights.device == 0) & flights.active
-    early, late = idle[:LATER].mean(), idle[LATER:].mean()
-    stuck = (idle[LATER:].mean(axis=0) > STUCK).mean()
+    early, late = (idle[part].sum() / flights.active[part].sum() for part in (slice(LATER), slice(LATER, None)))
+    stuck = (idle[LATER:].sum(axis=0) > STUCK * flights.active[LATER:].sum(axis=0)).mean()
     return (
         f"| {name} | {returns.mean():.0f} ± {half:.0f} | {np.median(returns):.0f} | {start:.0f} | {100 * early:.1f} | "
         f"{100 * late:.1f} | {100 * stuck:.0f} |"

@@ -4,8 +4,9 @@
 
 At one step of each trial flight the aircraft holds, or flies a whole step towards the hover heuristic's point, or away
 from it; then the policy goes on under the same draws. Half of towards less away, a metre, is what a metre nearer is
-worth; hold less the mean of both is what a metre costs. Returns are plain sums to the flight's end, Q is discounted.
-Flights within `NEAR_M` of the point count as arrived and are left out, and so are those in which one draw decides.
+worth; hold less the mean of both is what a metre costs. Returns are discounted as Q is, but end with the flight, and
+their tails are not clipped. Flights within `NEAR_M` of the point count as arrived; those that would meet the border when
+flying away, or in which one draw of the fading decides, are left out, too. Intervals are over layouts.
 """
 
 from __future__ import annotations
@@ -59,42 +60,55 @@ class Moved:
         return FlightAction(self.displacement_m, device)
 
 
-def answers(policy: AgentPolicy, trial: EvaluationSet, step: int) -> tuple[Float, Float, Float]:
-    """Distance to go (n,) in metres, and what came of each of `MOVES`, (3, n), by flights and by the critic."""
+def answers(policy: AgentPolicy, trial: EvaluationSet, step: int) -> tuple[Float, Float, Float, Float]:
+    """Where each flight was and headed (n, 2), and what came of each of `MOVES`, (3, n), by flights and by the critic.
+
+    The position is in metres; the heading leads to the hover point and is as long as the way to it.
+    """
     point = fly(make_policy("hover"), trial).position_m[-1]
     position = fly(policy, trial, deterministic=True).position_m[step]
-    distance = np.linalg.norm(point - position, axis=1)
-    heading = (point - position) / np.maximum(distance, 1e-9)[:, None]
+    way = point - position
+    heading = way / np.maximum(np.linalg.norm(way, axis=1), 1e-9)[:, None]
+    discount = policy.agent.config.discount
     flown, said = [], []
     for sign in MOVES.values():
         moved = Moved(policy, step, sign * policy.reach_m * heading)
         flights = fly(moved, trial)
-        flown.append((flights.reward * flights.active)[step:].sum(axis=0))
+        reward = (flights.reward * flights.active)[step:]
+        flown.append((discount ** np.arange(len(reward))[:, None] * reward).sum(axis=0))
         said.append(moved.q)
-    return distance, np.array(flown), np.array(said, dtype=np.float64)
+    return position, way, np.array(flown), np.array(said, dtype=np.float64)
 
 
-def interval(values: Float) -> str:
-    """Mean and half of its normal 95 % interval."""
-    return f"{values.mean():.3f} ± {1.96 * values.std(ddof=1) / len(values) ** 0.5:.3f}"
+def interval(values: Float, layout: NDArray[np.int64]) -> str:
+    """Mean over layouts of each one's mean, and half of its normal 95 % interval."""
+    means = np.array([values[layout == one].mean() for one in np.unique(layout)])
+    return f"{means.mean():.3f} ± {1.96 * means.std(ddof=1) / len(means) ** 0.5:.3f}"
 
 
 def main(paths: list[str]) -> None:
     """Print the table."""
     torch.set_num_threads(1)
-    trial = evaluation_set(load_scenario("released"), "random", LAYOUTS, seed=TRIAL_SEED, fading_seeds=FADINGS)
-    print("| policy | step | flights | a metre nearer, flown | by Q | a metre's cost, flown | by Q |")
+    scenario = load_scenario("released")
+    trial = evaluation_set(scenario, "random", LAYOUTS, seed=TRIAL_SEED, fading_seeds=FADINGS)
+    layout, size_m = np.repeat(np.arange(LAYOUTS), FADINGS), np.array([scenario.area.width_m, scenario.area.depth_m])
+    print(
+        "| policy | step | flights (near, border, rare) | a metre nearer, flown | by Q | a metre's cost, flown | by Q |"
+    )
     print("|---" * 7 + "|")
     for path in paths:
         policy = learned(Path(path))
         for step in STEPS:
-            distance, *found = answers(policy, trial, step)
-            kept = (distance > NEAR_M) & (np.abs(found[0] - found[0][0]).max(axis=0) < RARE)
-            cells = [str(step), str(kept.sum())]
+            position, way, *found = answers(policy, trial, step)
+            distance = np.linalg.norm(way, axis=1)
+            behind = position - policy.reach_m * way / np.maximum(distance, 1e-9)[:, None]
+            near, border = distance <= NEAR_M, ((behind < 0) | (behind > size_m)).any(axis=1)
+            rare = np.abs(found[0] - found[0][0]).max(axis=0) >= RARE
+            kept = ~(near | border | rare)
+            left_out = f"{near.sum()}, {(~near & border).sum()}, {(~near & ~border & rare).sum()}"
             hold, towards, away = np.moveaxis(np.array(found)[:, :, kept], 1, 0) / policy.reach_m
-            cells += [interval(one) for one in (towards - away) / 2]
-            cells += [interval(one) for one in hold - (towards + away) / 2]
-            print(f"| {path} | {cells[0]} | {' | '.join(cells[1:])} |", flush=True)
+            cells = [interval(one, layout[kept]) for one in (*(towards - away) / 2, *(hold - (towards + away) / 2))]
+            print(f"| {path} | {step} | {kept.sum()} ({left_out}) | {' | '.join(cells)} |", flush=True)
 
 
 if __name__ == "__main__":

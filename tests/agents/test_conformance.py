@@ -303,7 +303,7 @@ def test_an_unknown_preset_is_refused(name: str, which: str) -> None:
     "changes",
     [
         {"gradient": "last_k", "gradient_steps": 6},
-        {"final_action_noise": 0.2, "action_noise": 0.1},
+        {"action_noise": 0.1, "final_action_noise": 0.2},
         {"final_action_noise": 0.0},
         {"guidance": "softmax"},
         {"bc_weight": 1.1},

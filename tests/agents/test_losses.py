@@ -327,16 +327,18 @@ def test_action_noise_falls_by_equal_factors_over_a_training() -> None:
         batch("mlp", ROWS),
         noise(8, ROWS, 2),
     )
-    assert made.action_noise() == pytest.approx(0.4)
+    assert made.noise_now() == pytest.approx(0.4)
     made.progress = 0.5
-    assert made.action_noise() == pytest.approx(0.2)
+    assert made.noise_now() == pytest.approx(0.2)
     chain, half = ChainNoise(noise(5, ROWS, 2 + D), noise(6, 3, ROWS, 2 + D)), diffusion_sac("mlp", action_noise=0.2)
     half.networks.load_state_dict(made.networks.state_dict())
     torch.testing.assert_close(made.critic_loss(data, chain, None, eps)[0], half.critic_loss(data, chain, None, eps)[0])
     made.progress = 1.0
-    assert made.action_noise() == pytest.approx(0.1)
+    assert made.noise_now() == pytest.approx(0.1)
+    none = diffusion_sac("mlp", action_noise=0.0, final_action_noise=0.1)
+    assert none.noise_now() == 0
     half.progress = 0.7
-    assert half.action_noise() == 0.2
+    assert half.noise_now() == 0.2
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.3])

@@ -43,11 +43,11 @@ def test_a_line_counts_flown_steps_only(monkeypatch: pytest.MonkeyPatch) -> None
     steps, flights = 120, 2
     device = np.ones((steps, flights), dtype=int)
     device[:10, 0] = 0  # 5 % of the first hundred steps of both
-    device[100:105, 1] = 0  # a quarter of flight 1's later steps
+    device[100:105, 1] = 0  # half of flight 1's later steps, a quarter of all
     active = np.ones((steps, flights), dtype=bool)
     active[110:] = False
     reward = np.full((steps, flights), -1.0)
     reward[:, 1] = -2.0
     made: Any = SimpleNamespace(reward=reward, active=active, device=device)
     # returns -110 and -220, +-1.96 * 77.8 / sqrt 2; the first fifty steps -50 and -100
-    assert parts.line("made", made) == "| made | -165 \u00b1 108 | -165 | -75 | 5.0 | 12.5 | 50 |"
+    assert parts.line("made", made) == "| made | -165 \u00b1 108 | -165 | -75 | 5.0 | 25.0 | 50 |"

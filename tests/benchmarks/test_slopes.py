@@ -37,18 +37,21 @@ def test_only_one_step_is_another(learned: AgentPolicy) -> None:
 
 def test_answers_are_of_holding_of_flying_nearer_and_away(learned: AgentPolicy) -> None:
     trial = evaluation_set(SCENARIO, "random", 4, seed=3)
-    distance, flown, said = answers(learned, trial, 2)
+    position, way, flown, said = answers(learned, trial, 2)
     own, point = fly(learned, trial, deterministic=True), fly(make_policy("hover"), trial).position_m[-1]
-    np.testing.assert_allclose(distance, np.linalg.norm(own.position_m[2] - point, axis=1))
+    np.testing.assert_array_equal(position, own.position_m[2])
+    np.testing.assert_allclose(way, point - position)
+    distance = np.linalg.norm(way, axis=1)
     hold = fly(Moved(learned, 2, np.zeros((4, 2))), trial)
-    np.testing.assert_allclose(flown[0], (hold.reward * hold.active)[2:].sum(axis=0))
+    gamma = learned.agent.config.discount ** np.arange(6)
+    np.testing.assert_allclose(flown[0], gamma @ (hold.reward * hold.active)[2:])
     assert flown.shape == said.shape == (3, 4)
-    heading = (point - own.position_m[2]) / distance[:, None]
-    towards = Moved(learned, 2, learned.reach_m * heading)
+    towards = Moved(learned, 2, learned.reach_m * way / distance[:, None])
     nearer = np.linalg.norm(fly(towards, trial).position_m[3] - point, axis=1)
     np.testing.assert_allclose(nearer, distance - learned.reach_m)
     np.testing.assert_array_equal(said[1], towards.q)
 
 
-def test_an_interval_is_of_the_mean() -> None:
-    assert slopes.interval(np.array([1.0, 3.0])) == "2.000 \u00b1 1.960"
+def test_an_interval_is_over_layouts() -> None:
+    values, layout = np.array([0.0, 2.0, 3.0, 3.0, 3.0]), np.array([4, 4, 7, 7, 7])
+    assert slopes.interval(values, layout) == "2.000 \u00b1 1.960"

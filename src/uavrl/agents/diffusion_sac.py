@@ -70,7 +70,7 @@ class DiffusionSacConfig(AgentConfig):
         None,
         gt=0,
         description="where action_noise ends, falling geometrically over a training: wide first, so that a drift pays; "
-        "then narrow, since wide noise also makes a slow flight the best one; none: constant",
+        "then narrow, since wide noise also makes a slow flight the best one; null: constant",
     )
     pinned_level: bool = Field(
         False,
@@ -116,9 +116,10 @@ class DiffusionSacConfig(AgentConfig):
             raise ValueError(
                 "guidance = 'softmax' needs a critic with the choice as input: kind 'mlp', choice_heads false"
             )
-        if self.final_action_noise is not None and self.final_action_noise > self.action_noise:
+        if self.final_action_noise is not None and 0 < self.action_noise < self.final_action_noise:
             raise ValueError(
-                f"final_action_noise = {self.final_action_noise} must be <= action_noise = {self.action_noise}"
+                f"action_noise = {self.action_noise} must be >= final_action_noise = {self.final_action_noise}, "
+                "or that null: constant noise"
             )
         return self
 
@@ -288,14 +289,14 @@ class DiffusionSac(Agent):
         best = q.view(rows, count).argmax(dim=1) + count * torch.arange(rows, device=q.device)
         return HybridAction(drawn.continuous[best], choice[best])
 
-    def action_noise(self) -> float:
-        """Standard deviation now, at this share of the training."""
+    def noise_now(self) -> float:
+        """Standard deviation of the action noise at this share of the training."""
         first, last = self.config.action_noise, self.config.final_action_noise
-        return first if last is None else float(first * (last / first) ** self.progress)
+        return first if last is None or first == 0 else float(first * (last / first) ** self.progress)
 
     def _jittered(self, w: Tensor, jitter: Tensor | None) -> Tensor:
         """w (B, C) with action noise, in the box; its gradient leads back into the box, not out of it."""
-        return w if jitter is None else straight_through_clamp(w + self.action_noise() * jitter)
+        return w if jitter is None else straight_through_clamp(w + self.noise_now() * jitter)
 
     def _best(self, critic: Critic, context: Context, action: HybridAction) -> tuple[Tensor, Tensor]:
         """(min Q, choice), each (B,), of w with its own choice, or with the best one where the config says so."""

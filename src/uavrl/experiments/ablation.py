@@ -66,7 +66,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "displacement weight 1": {"displacement_weight": 1.0},
     "displacement weight 10": {"displacement_weight": 10.0},
     "rewards not centred": {"reward": {"transform": "none"}},
-    "no action noise": {"action_noise": 0.0, "final_action_noise": None},
+    "no action noise": {"action_noise": 0.0},
     "action noise constant": {"final_action_noise": None},
     "level not pinned": {"pinned_level": False},
     "discount .99": {"discount": 0.99},

@@ -102,8 +102,8 @@ def advance(
     wants = action.device > 0
     # one flat index into N x K is looked up several times as fast as a pair of indices
     index = xp.maximum(action.device - 1, 0)
-    place = xp.arange(index.shape[0], device=index.device) * layout_m.shape[1] + index
-    device_m = xp.take(layout_m.reshape((-1, 2)), place, axis=0)
+    rows = xp.arange(index.shape[0], device=index.device)
+    device_m = xp.take(layout_m.reshape((-1, 2)), rows * layout_m.shape[1] + index, axis=0)
     snr, rate, bits = _transmit(scenario, device_m, position, index, draws)
     transmission_s = channel.transmission_s(bits, rate)
     limit_s = scenario.channel.max_transmission_s
@@ -125,9 +125,9 @@ def advance(
     idle_j = energy.idle_energy_j(idle_s, frame)
     total_j = move_j + communication_j + idle_j  # eq. (energy_total)
 
-    reset = xp.zeros((index.shape[0] * layout_m.shape[1],), dtype=xp.bool, device=index.device)
-    reset[place] = arrived
-    ages = age.next_age_s(state.age_s, reset.reshape(state.age_s.shape), duration_s, traffic.max_age_s)
+    devices = xp.arange(layout_m.shape[1], dtype=index.dtype, device=index.device)
+    reset = xp.where(arrived, index, -1)[:, None] == devices
+    ages = age.next_age_s(state.age_s, reset, duration_s, traffic.max_age_s)
     age_cost = age_term(scenario, state.age_s, ages, duration_s)
     energy_term = total_j / hover_reference_j(scenario, energy.hover_power_w(frame))
     reward = -(objective.age_weight * age_cost + (1.0 - objective.age_weight) * energy_term)  # eq. (reward)

@@ -44,7 +44,8 @@ def learn_once(agent: Agent, data: Batch, generator: torch.Generator) -> Metrics
 def fit(agent: Agent, data: Batch, updates: int, generator: torch.Generator) -> dict[str, float]:
     """Set the normalisers from `data`, then update on minibatches of it; the last update's metrics.
 
-    Rewards are learned from as they stand: centre them (minus their median) where episodes are only cut by time, or Q
+    What falls over a training (`Agent.progress`) falls over these updates, so make them one call. Rewards are learned
+    from as they stand: centre them (minus their median) where episodes are only cut by time, or Q
     starts far from where it has to go.
     """
     fit_normalisers(agent.networks, data.observation)
