@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
+from uavrl.benchmarks import simulate
 from uavrl.benchmarks.simulate import SINGLE_ACTIONS, Batch, Single, step_bytes
 from uavrl.scenario import load_scenario
 from uavrl.simulation.environment import DataCollectionEnv
@@ -15,6 +17,18 @@ def test_a_batch_goes_on_from_where_it_was_in_numpy_and_in_torch() -> None:
         batch.step()
         assert batch.state.age_s.shape == (5, 3)
         assert (np.asarray(batch.state.step) == 2).all()
+
+
+def test_a_batch_starts_anew_when_its_episodes_end_and_keeps_moving(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(simulate, "EPISODE", 30)
+    batch = Batch(load_scenario("released", devices=3), 200)
+    for _ in range(30):
+        before = batch.state.position_m
+        batch.step()
+    assert (batch.state.step == 30).all()
+    assert (batch.state.position_m != before).any(axis=1).mean() > 0.9
+    batch.step()
+    assert (batch.state.step == 1).all()
 
 
 def test_a_steps_bytes_grow_by_the_ages_alone() -> None:

@@ -17,7 +17,7 @@ def test_a_rate_counts_work_and_leaves_the_warm_up_out() -> None:
     found = rate(call, work=10.0, seconds=0.3, repeats=3)
     assert found.slowest <= found.per_s <= found.fastest
     assert 500 < found.per_s < 5_000  # the first call's .2 s would make it 50
-    assert len(calls) == 4  # one call fills the warm-up, and is what a repeat is made of
+    assert len(calls) > 100  # the slow first call does not set how many a repeat has
 
 
 def test_the_machine_says_what_ran() -> None:

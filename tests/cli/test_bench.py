@@ -26,11 +26,11 @@ def test_simulation_is_measured_beside_its_floors(tmp_path: Path, monkeypatch: p
     file, plot = tmp_path / "a.json", tmp_path / "a.png"
     assert main(["bench", "simulate", "--seconds", "0.02", "--json", str(file), "--plot", str(plot)]) == 0
     found = json.loads(file.read_text())
-    for name in ("batch_steps", "single_steps"):
+    for name in ("batch_steps", "vector_steps", "single_steps"):
+        assert found[f"{name}_slowest_per_s"] <= found[f"{name}_per_s"] <= found[f"{name}_fastest_per_s"]
         assert 0 < found[f"{name}_per_s"] < found[f"{name}_floor_per_s"]
     sizes = [(row["environments"], row["devices"]) for row in found["scaling"]]
     assert sizes == [(1, 10), (10, 10), (1000, 1), (1000, 10)]
-    assert found["machine"]["threads"] == 1
     assert plot.read_bytes()[:4] == b"\x89PNG"
 
 
@@ -43,7 +43,9 @@ def test_training_is_measured_beside_its_products(
     found = json.loads(file.read_text())
     assert 0 < found["default_updates_per_s"] < found["default_updates_floor_per_s"]
     assert found["default_gflop_per_update"] == pytest.approx(1.24, abs=0.02)
-    assert "of it" in capsys.readouterr().out
+    assert found["machine"]["threads"] == 1
+    share = 100 * found["default_updates_per_s"] / found["default_updates_floor_per_s"]
+    assert f"{share:.1f}% of the" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -51,7 +53,8 @@ def test_training_is_measured_beside_its_products(
     [
         (["--seconds", "0"], "--seconds 0.0, allowed: 0.01 to 3600"),
         (["--threads", "0"], "--threads 0, allowed: 1 or more"),
-        (["--json", "nowhere/a.json"], "nowhere/a.json"),
+        (["--json", "nowhere/a.json"], "the directory 'nowhere' does not exist"),
+        (["--json", "."], "is a directory, allowed: a file to write"),
     ],
 )
 def test_wrong_words_are_refused_in_one_line(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import itertools
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -12,18 +15,21 @@ from uavrl.benchmarks.timing import copied_bytes_per_s, rate
 from uavrl.physics.arrays import Array
 from uavrl.scenario import Scenario, load_scenario
 from uavrl.simulation.dynamics import advance, initial_state
+from uavrl.simulation.environment import DataCollectionVectorEnv
 from uavrl.simulation.state import Draws, FlightAction, Outcome, SimState
 
 BATCH = 8_192
+ACTIONS = 16  # of each environment, in turn
+EPISODE = 400
 SINGLE_ACTIONS = 512
 SCALED_ENVIRONMENTS = (1, 10, 100, 1_000, 10_000, 100_000)  # with 10 devices
 SCALED_DEVICES = (1, 10, 100, 1_000)  # with 1,000 environments
 
 
 class Batch:
-    """N environments that fly random actions on random layouts; `step` goes on from where the last one ended.
+    """N environments that fly random actions on random layouts, and start anew when their episodes end.
 
-    Actions are drawn once, the fading anew at each step: it is the simulator's own work.
+    The actions are a few that were drawn once, in turn; the fading is drawn at each step, as the simulator's own work.
     """
 
     def __init__(self, scenario: Scenario, count: int, device: str | None = None) -> None:
@@ -33,8 +39,8 @@ class Batch:
         arrays: list[Array] = [
             generator.random((count, devices, 2)) * area,
             generator.random((count, 2)) * area,
-            generator.uniform(-reach_m, reach_m, (count, 2)),
-            generator.integers(0, devices + 1, count),
+            generator.uniform(-reach_m, reach_m, (ACTIONS, count, 2)),
+            generator.integers(0, devices + 1, (ACTIONS, count)),
         ]
         self.generator: Any = generator
         if device is not None:
@@ -42,10 +48,11 @@ class Batch:
             arrays[:3] = [array.float() for array in arrays[:3]]
             self.generator = torch.Generator(device).manual_seed(0)
         self.scenario, self.layout_m, self.on = scenario, arrays[0], device
-        self.state, self.action = initial_state(arrays[1], devices), FlightAction(arrays[2], arrays[3])
+        self.start, self.actions = initial_state(arrays[1], devices), FlightAction(arrays[2], arrays[3])
+        self.state, self.steps = self.start, 0
 
     def _draw(self) -> Draws:
-        count = len(self.action.device)
+        count = len(self.layout_m)
         if self.on is None:
             return Draws(self.generator.standard_normal((count, 2)), self.generator.random(count))
         scatter = torch.randn((count, 2), generator=self.generator, device=self.on)
@@ -53,13 +60,18 @@ class Batch:
 
     def step(self) -> None:
         """Every environment once."""
-        self.state, _ = advance(self.scenario, self.layout_m, self.state, self.action, self._draw())
+        if self.steps == EPISODE:
+            self.state, self.steps = self.start, 0
+        turn = self.steps % ACTIONS
+        action = FlightAction(self.actions.displacement_m[turn], self.actions.device[turn])
+        self.state, _ = advance(self.scenario, self.layout_m, self.state, action, self._draw())
+        self.steps += 1
         if self.on not in (None, "cpu"):
             torch.cuda.synchronize()
 
 
 def step_bytes(scenario: Scenario) -> int:
-    """Least memory traffic of one environment's step in float64: what goes in is read, what comes out written, once."""
+    """Memory traffic of one environment's step in float64: what goes in is read, what comes out is written, once."""
     before, devices = np.zeros((1, 2)), scenario.traffic.devices
     state, action = initial_state(before, devices), FlightAction(before, np.ones(1, dtype=np.int64))
     draws = Draws(np.ones((1, 2)), np.ones(1))
@@ -78,18 +90,17 @@ class Returning(gymnasium.Env[Any, Any]):
 
     def __init__(self, like: gymnasium.Env[Any, Any]) -> None:
         self.observation_space, self.action_space = like.observation_space, like.action_space
-        self.observation, self.info = like.reset(seed=0)
+        observation, info = like.reset(seed=0)
+        self.answers = itertools.cycle([(observation.copy(), 0.0, False, False, copy.deepcopy(info)) for _ in range(2)])
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """The same each time."""
-        return self.observation.copy(), self._info()
-
-    def _info(self) -> dict[str, Any]:
-        return {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in self.info.items()}
+        """What the real one answered, prebuilt; two in turn, since Gymnasium warns of one and the same object."""
+        observation, *_, info = next(self.answers)
+        return observation, info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """The same each time."""
-        return self.observation.copy(), 0.0, False, False, self._info()
+        """As `reset`."""
+        return next(self.answers)
 
 
 class Single:
@@ -98,11 +109,8 @@ class Single:
     def __init__(self, scenario: Scenario, *, nothing: bool = False) -> None:
         self.environment = gymnasium.make("uavrl/DataCollection-v0", scenario=scenario)
         if nothing:
-            wrappers = (gymnasium.wrappers.PassiveEnvChecker, gymnasium.wrappers.OrderEnforcing)
-            inner: gymnasium.Env[Any, Any] = Returning(self.environment.unwrapped)
-            for wrapper in wrappers:
-                inner = wrapper(inner)
-            self.environment = inner
+            checked = gymnasium.wrappers.PassiveEnvChecker(Returning(self.environment.unwrapped))
+            self.environment = gymnasium.wrappers.OrderEnforcing(checked)
         self.environment.action_space.seed(0)
         self.actions = [self.environment.action_space.sample() for _ in range(SINGLE_ACTIONS)]
         self.environment.reset(seed=0)
@@ -115,25 +123,36 @@ class Single:
                 self.environment.reset()
 
 
-def measure(seconds: float) -> dict[str, float]:
-    """Steps a second of the batch and of the single environment, with their floors; the batch on a GPU if there is one.
+def vector_environment(scenario: Scenario) -> Callable[[], Any]:
+    """A step of the vector environment with random actions: observation, info and resets included."""
+    environment = DataCollectionVectorEnv(BATCH, scenario)
+    environment.action_space.seed(0)
+    environment.reset(seed=0)
+    turns = itertools.cycle([environment.action_space.sample() for _ in range(ACTIONS)])
+    return lambda: environment.step(next(turns))
 
-    The batch's floor is the least memory traffic at the rate of a plain copy; the single environment's, Gymnasium's own
-    loop around an environment that does nothing.
+
+def measure(seconds: float) -> dict[str, float]:
+    """Steps a second of a batch, of the vector environment and of the single one, with their floors.
+
+    The floor of the first two is the memory traffic of arguments and results at the rate of a plain copy of that size;
+    the single environment's is Gymnasium's own loop around an environment that does nothing. On a GPU, where there is
+    one, the batch is measured without a floor.
     """
     scenario = load_scenario("released")
-    batch = Batch(scenario, BATCH)
     size = step_bytes(scenario)
+    memory = copied_bytes_per_s(size * BATCH // 2) / size
+    alone = rate(Single(scenario, nothing=True).fly, work=SINGLE_ACTIONS, seconds=seconds)
     found = {
-        "batch_steps_per_s": rate(batch.step, work=BATCH, seconds=seconds).per_s,
-        "batch_steps_floor_per_s": copied_bytes_per_s(size * BATCH // 2) / size,
-        "single_steps_per_s": rate(Single(scenario).fly, work=SINGLE_ACTIONS, seconds=seconds).per_s,
-        "single_steps_floor_per_s": rate(
-            Single(scenario, nothing=True).fly, work=SINGLE_ACTIONS, seconds=seconds
-        ).per_s,
+        **rate(Batch(scenario, BATCH).step, work=BATCH, seconds=seconds).named("batch_steps"),
+        "batch_steps_floor_per_s": memory,
+        **rate(vector_environment(scenario), work=BATCH, seconds=seconds).named("vector_steps"),
+        "vector_steps_floor_per_s": memory,
+        **rate(Single(scenario).fly, work=SINGLE_ACTIONS, seconds=seconds).named("single_steps"),
+        "single_steps_floor_per_s": alone.per_s,
     }
     if torch.cuda.is_available():
-        found["gpu_batch_steps_per_s"] = rate(Batch(scenario, BATCH, "cuda").step, work=BATCH, seconds=seconds).per_s
+        found |= rate(Batch(scenario, BATCH, "cuda").step, work=BATCH, seconds=seconds).named("gpu_batch_steps")
     return found
 
 

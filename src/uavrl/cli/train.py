@@ -44,7 +44,7 @@ class Train:
     scenario: str | None = None
     """preset or TOML file; by default the one that the data carry"""
     preset: Literal["default", "paper"] = "default"
-    """the settings that we recommend (about a quarter of an hour on one free core), or the paper's as printed"""
+    """the settings that we recommend (about a quarter of an hour on one core), or the paper's as printed"""
     updates: int | None = None
     """gradient steps; by default what the preset says"""
     seed: int = 0
