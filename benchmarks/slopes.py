@@ -5,8 +5,8 @@
 At one step of each trial flight the aircraft holds, or flies a whole step towards the hover heuristic's point, or away
 from it; then the policy goes on under the same draws. Half of towards less away, a metre, is what a metre nearer is
 worth; hold less the mean of both is what a metre costs. Returns are discounted as Q is, but end with the flight, and
-their tails are not clipped. Flights within `NEAR_M` of the point count as arrived; those that would meet the border if they
-flew away, or in which one draw decides, are left out, too. Intervals are over layouts.
+their tails are not clipped. Left out are flights within `NEAR_M` of the point, which have arrived; those that would
+meet the border if they flew away; and those in which one draw decides. Intervals are over layouts.
 """
 
 from __future__ import annotations

@@ -189,3 +189,19 @@ def test_nothing_is_clipped_at_the_edge_of_a_file(tmp_path: Path) -> None:
 def test_a_file_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be written"):
         figures.hero(written_by_hand(), tmp_path / "none" / "hero.png")
+
+
+def test_step_times_are_drawn_over_what_varied(tmp_path: Path, drawn: list[Figure]) -> None:
+    rows = [
+        {"environments": count, "devices": devices, "step_s": 1e-3 * count * devices}
+        for count, devices in ((1, 10), (8, 10), (4, 10), (4, 1), (4, 100))
+    ]
+    figures.step_times(rows, tmp_path / "a.png")
+    (figure,) = drawn
+    counts, devices = (np.asarray(axes.get_lines()[0].get_xydata(), dtype=float) for axes in figure.axes)
+    np.testing.assert_allclose(counts, [(1, 10), (4, 40), (8, 80)])
+    np.testing.assert_allclose(devices, [(1, 4), (10, 40), (100, 400)])
+    for axes in figure.axes:  # these are proportional, so the line of slope 1 lies on them
+        measured, proportional = (np.asarray(line.get_xydata(), dtype=float) for line in axes.get_lines())
+        np.testing.assert_allclose(proportional, measured)
+    assert "10 devices" in figure.axes[0].get_xlabel()

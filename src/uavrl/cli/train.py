@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -95,7 +97,8 @@ class Train:
                 raise ConfigError(f"--out '{self.out}' holds a run already; give --resume or another directory")
             learner = OfflineLearner(config, transitions, self.device)
         elif learner.config != config:
-            raise ConfigError(f"--resume: '{self.out}' was started with other settings; give the same ones")
+            began = ", ".join(_differing(learner.config.model_dump(), config.model_dump()))
+            raise ConfigError(f"--resume: '{self.out}' was started with other settings, give the same ones: {began}")
         else:
             print(f"going on from update {learner.updates:,}", file=sys.stderr)
         trial = trial_flights(transitions, scenario) if self.evaluate_every else None
@@ -109,6 +112,16 @@ class Train:
         print(summary(read_metrics(self.out / "metrics.jsonl"), learner.expected))
         print(f"{learner.updates:,} updates on {len(transitions):,} transitions; policy in {self.out}")
         print(f"next: uavrl evaluate --policy tdm --policy {self.out} --scenario {scenario.name}")
+
+
+def _differing(began: dict[str, Any], asked: dict[str, Any], section: str = "") -> Iterator[str]:
+    """Each setting of `began` that is another one in `asked`, as name=value."""
+    for name, value in began.items():
+        other = asked.get(name)
+        if isinstance(value, dict) and isinstance(other, dict):
+            yield from _differing(value, other, f"{section}{name}.")
+        elif other != value:
+            yield f"{section.removeprefix('agent.')}{name}={json.dumps(value)}"  # as --set names it
 
 
 def trial_flights(transitions: Transitions, scenario: Scenario, episodes: int = 20) -> Evaluator:
