@@ -47,7 +47,7 @@ _PAPER_CRITIC: dict[str, Any] = {"discount": 0.99, "polyak": 0.005, "huber": Non
 
 PRESETS: dict[str, dict[str, Offline]] = {
     "diffusion_sac": {
-        "default": DiffusionSacConfig(  # what won on flights, which are long and cut, not ended
+        "default": DiffusionSacConfig(  # for flights, which are long and cut, not ended: docs/what-matters.md
             discount=0.9995,
             polyak=0.5,
             pinned_level=True,
