@@ -119,7 +119,7 @@ class DiffusionSacConfig(AgentConfig):
         if self.final_action_noise is not None and 0 < self.action_noise < self.final_action_noise:
             raise ValueError(
                 f"action_noise = {self.action_noise} must be >= final_action_noise = {self.final_action_noise}, "
-                "or that null: constant noise"
+                "or that be null (constant noise)"
             )
         return self
 
