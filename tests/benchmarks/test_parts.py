@@ -5,25 +5,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from benchmarks import parts
-from uavrl.agents.diffusion_sac import DiffusionSac, DiffusionSacConfig
 from uavrl.evaluation.rollouts import evaluation_set, fly
-from uavrl.networks import NetworkConfig
 from uavrl.policies import make_policy
 from uavrl.scenario import load_scenario
-from uavrl.training.batches import spaces_of
 from uavrl.training.policy import AgentPolicy
 
 SCENARIO = load_scenario("released", max_steps=12)
-
-
-@pytest.fixture
-def learned() -> AgentPolicy:
-    torch.manual_seed(0)
-    config = DiffusionSacConfig(network=NetworkConfig(kind="devices", width=8))
-    return AgentPolicy("untrained", DiffusionSac(spaces_of(SCENARIO, "devices"), config), SCENARIO)
 
 
 def test_one_part_is_lent_and_the_other_kept(learned: AgentPolicy) -> None:
