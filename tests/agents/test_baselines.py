@@ -285,7 +285,7 @@ def test_losses_of_iql(kind: Kind, beta: float, limit: float) -> None:
     data = batch(kind, rows)
     with torch.no_grad():  # as many advantages above 0 as below
         middle = (made.target_q(data) - made.state_value(data.observation)).median()
-        made.value.out.bias.add_(middle)  # type: ignore[operator,union-attr]  # a tensor
+        made.value.rest.out.bias.add_(middle)  # type: ignore[operator,union-attr]  # a tensor
     v_loss, q_loss, actor_loss, capped = 0.0, 0.0, 0.0, 0
     for i in range(rows):
         seen, w, d = row(data.observation, i), data.action.continuous[i], int(data.action.choice[i])
@@ -487,7 +487,7 @@ def test_likelihood_trains_logits_means_and_deviations_of_every_choice(kind: Kin
     made, data = make(kind), batch(kind, 64)
     assert set(data.action.choice.tolist()) == set(range(D))
     found = gradients(loss_of(made, data), made.networks["actor"])
-    names = ["out.weight"] if kind == "mlp" else ["idle_out.weight", "device_out.weight"]
+    names = ["rest.out.weight"] if kind == "mlp" else ["idle_out.weight", "device_out.weight"]
     for name in names:
         weight = found[name]
         assert weight is not None
@@ -499,7 +499,7 @@ def test_likelihood_trains_logits_means_and_deviations_of_every_choice(kind: Kin
 def test_sacs_actor_is_trained_by_both_blocks_in_cql(kind: Kind) -> None:
     made = cql(kind)
     found = gradients(made.actor_loss(batch(kind, 64), noise(1, 64, 2))[0], made.actor)
-    names = ["out.weight"] if kind == "mlp" else ["global_out.weight", "device_out.weight"]
+    names = ["rest.out.weight"] if kind == "mlp" else ["global_out.weight", "device_out.weight"]
     for name in names:
         weight = found[name]
         assert weight is not None

@@ -74,7 +74,7 @@ def blocks(denoiser: Denoiser, gradient: dict[str, Tensor | None]) -> tuple[Tens
         return torch.cat([weight, bias[:, None]], dim=1)
 
     if isinstance(denoiser, MlpDenoiser):
-        return rows("out")[:2], rows("out")[2:]
+        return rows("rest.out")[:2], rows("rest.out")[2:]
     assert isinstance(denoiser, SetDenoiser)
     return rows("global_out")[:2], torch.cat([rows("global_out")[2:], rows("device_out")])
 
@@ -376,7 +376,7 @@ def test_sac_losses_train_their_own_networks(kind: Kind) -> None:
     found = gradients(actor, made.actor)
     assert all(value is not None for value in found.values())
     if kind == "mlp":
-        rows = found["out.weight"]
+        rows = found["rest.out.weight"]
         assert rows is not None
         assert (rows.norm(dim=1) > 1e-6).all()  # means, deviations and logits
     assert torch.autograd.grad(actor, made.log_temperature, retain_graph=True, allow_unused=True)[0] is None

@@ -9,10 +9,13 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.func import functional_call
 
 from tests.agents.problems import disturb, noise, observation
+from uavrl.networks.activations import ActivationName
 from uavrl.networks.mlp import (
     LOG_STD_RANGE,
+    Layers,
     MlpActor,
     MlpChoiceActor,
     MlpConditional,
@@ -79,8 +82,10 @@ def test_critic_is_the_sum_that_its_weights_say(heads: bool, log: bool) -> None:
         before = before + w.double().numpy() @ value[f"{name}.continuous.weight"].T
         for choice in range(K + 1):
             here = before if heads else before + value[f"{name}.choice.weight"][:, choice]
-            hidden = silu(silu(here) @ value[f"{name}.hidden.1.weight"].T + value[f"{name}.hidden.1.bias"])
-            q = (hidden @ value[f"{name}.out.weight"].T + value[f"{name}.out.bias"])[:, choice if heads else 0]
+            hidden = silu(silu(here) @ value[f"{name}.rest.hidden.0.weight"].T + value[f"{name}.rest.hidden.0.bias"])
+            q = (hidden @ value[f"{name}.rest.out.weight"].T + value[f"{name}.rest.out.bias"])[
+                :, choice if heads else 0
+            ]
             np.testing.assert_allclose(table[j, :, choice], q, rtol=1e-3, atol=1e-4)
             one_hot = torch.zeros(ROWS, K + 1)
             one_hot[:, choice] = 1.0
@@ -101,8 +106,8 @@ def test_denoiser_is_the_sum_that_its_weights_say() -> None:
     embedded = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
     first = normalised(s.double().numpy(), False) @ value["observation.weight"].T + value["observation.bias"]
     first = first + x.double().numpy() @ value["action.weight"].T + embedded @ value["step.weight"].T
-    hidden = silu(silu(first) @ value["hidden.1.weight"].T + value["hidden.1.bias"])
-    expected = hidden @ value["out.weight"].T + value["out.bias"]
+    hidden = silu(silu(first) @ value["rest.hidden.0.weight"].T + value["rest.hidden.0.bias"])
+    expected = hidden @ value["rest.out.weight"].T + value["rest.out.bias"]
     found = made(made.encode(s), x, step).detach().numpy()
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
     assert made.vector_size(made.encode(s)) == K + 3
@@ -112,8 +117,8 @@ def test_denoiser_is_the_sum_that_its_weights_say() -> None:
 def test_actors_deviation_is_bounded_and_its_parts_are_apart() -> None:
     made = MlpActor(K + 3, 2, K + 1, log=False, **SHAPE)
     with torch.no_grad():
-        made.out.weight.zero_()
-        made.out.bias.copy_(torch.tensor([0.1, 0.2, -1e3, 1e3, 1.0, 2.0, 3.0, 4.0, 5.0]))
+        made.rest.out.weight.zero_()
+        made.rest.out.bias.copy_(torch.tensor([0.1, 0.2, -1e3, 1e3, 1.0, 2.0, 3.0, 4.0, 5.0]))
     mean, log_std, logits = made(seen())
     torch.testing.assert_close(mean[0], torch.tensor([0.1, 0.2]))
     torch.testing.assert_close(log_std[0], torch.tensor(LOG_STD_RANGE))
@@ -124,8 +129,8 @@ def test_choice_actor_has_a_mean_and_a_deviation_of_each_choice() -> None:
     made = MlpChoiceActor(K + 3, 2, 3, log=False, **SHAPE)
     raw = torch.tensor([[1.0, 0.1, 0.2, -1e3, 1e3], [2.0, 0.3, 40.0, 0.0, 0.0], [3.0, -0.5, -40.0, 1e3, -1e3]])
     with torch.no_grad():
-        made.out.weight.zero_()
-        made.out.bias.copy_(raw.flatten())
+        made.rest.out.weight.zero_()
+        made.rest.out.bias.copy_(raw.flatten())
     mean, log_std, logits = made(seen())
     low, high = LOG_STD_RANGE
     middle = (low + high) / 2
@@ -150,8 +155,8 @@ def test_conditional_is_the_sum_that_its_weights_say(inputs: int, choices: int) 
         first = first + x.double().numpy() @ value["inputs.weight"].T
     if d is not None:
         first = first + d.double().numpy() @ value["choice.weight"].T
-    hidden = silu(silu(first) @ value["hidden.1.weight"].T + value["hidden.1.bias"])
-    expected = hidden @ value["out.weight"].T + value["out.bias"]
+    hidden = silu(silu(first) @ value["rest.hidden.0.weight"].T + value["rest.hidden.0.bias"])
+    expected = hidden @ value["rest.out.weight"].T + value["rest.out.bias"]
     np.testing.assert_allclose(made(made.encode(s), x, d).detach().numpy(), expected, rtol=1e-3, atol=1e-4)
 
 
@@ -168,3 +173,38 @@ def test_a_set_of_devices_is_refused() -> None:
     made = MlpActor(K + 3, 2, K + 1, log=False, **SHAPE)
     with pytest.raises(TypeError, match="paper"):
         made({"uav": torch.zeros(1, 4), "devices": torch.zeros(1, K, 6)})
+
+
+@pytest.mark.parametrize("layer_norm", [False, True])
+@pytest.mark.parametrize("activation", ["silu", "mish", "relu"])
+def test_layers_have_the_gradient_of_what_they_compute(activation: ActivationName, layer_norm: bool) -> None:
+    torch.manual_seed(0)
+    made = Layers(5, 3, 4, activation, layer_norm).double()
+    first = torch.randn(6, 5, dtype=torch.float64, requires_grad=True)
+    names, parameters = zip(*made.named_parameters(), strict=True)
+
+    def run(first: torch.Tensor, *values: torch.Tensor) -> torch.Tensor:
+        out: torch.Tensor = functional_call(made, dict(zip(names, values, strict=True)), (first,))
+        return out
+
+    assert torch.autograd.gradcheck(run, (first, *parameters))
+
+
+def test_layers_are_linear_layers_with_activations_between() -> None:
+    torch.manual_seed(0)
+    made, first = Layers(5, 2, 4, "mish", layer_norm=True), torch.randn(6, 5)
+    assert made.norms is not None
+    mish = torch.nn.functional.mish
+    hidden = made.hidden[0](mish(made.norms[0](first)))
+    torch.testing.assert_close(made(first), made.out(mish(made.norms[1](hidden))))
+
+
+def test_frozen_layers_still_lead_a_gradient_through() -> None:
+    made, first = Layers(5, 2, 4, "silu", layer_norm=False), torch.randn(6, 5, requires_grad=True)
+    (free,) = torch.autograd.grad(made(first).sum(), first)
+    made.requires_grad_(False)
+    loss = made(first).sum()
+    made.requires_grad_(True)
+    (through,) = torch.autograd.grad(loss, first, retain_graph=True)
+    torch.testing.assert_close(through, free)
+    assert all(found is None for found in torch.autograd.grad(loss, list(made.parameters()), allow_unused=True))

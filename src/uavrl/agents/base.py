@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal
 
@@ -121,6 +122,16 @@ def minimise(
     norm = torch.nn.utils.clip_grad_norm_(parameters, clip if clip is not None else float("inf"))
     optimiser.step()
     return norm
+
+
+@contextmanager
+def frozen(network: nn.Module) -> Iterator[None]:
+    """Inside, what `network` computes has gradients for its inputs alone; those for its weights cost as much again."""
+    network.requires_grad_(False)
+    try:
+        yield
+    finally:
+        network.requires_grad_(True)
 
 
 @torch.no_grad()

@@ -30,6 +30,7 @@ from uavrl.agents.base import (
     adam,
     bellman_loss,
     discounts,
+    frozen,
     minimise,
     move_towards,
 )
@@ -125,9 +126,9 @@ class Bcq(Agent):
         with torch.no_grad():
             z = noise.clamp(-self.config.latent_clip, self.config.latent_clip)
             w = self._decoded(self.decoder.encode(batch.observation), z, one_hot)
-            context = self.critic.encode(batch.observation)
         w = self._perturbed(self.actor, self.actor.encode(batch.observation), w, one_hot)
-        loss = -self.critic.value(context, w, one_hot)[0].mean()
+        with frozen(self.critic):
+            loss = -self.critic.value(self.critic.encode(batch.observation), w, one_hot)[0].mean()
         return loss, {"actor_loss": loss.detach()}
 
     def propose(

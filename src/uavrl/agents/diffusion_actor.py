@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
 from uavrl.actions import HybridAction, decode
-from uavrl.diffusion import Schedule, ScheduleName, ddim, ddpm, make_schedule
+from uavrl.diffusion import ChainDenoiser, Schedule, ScheduleName, ddim, ddpm, make_schedule
 from uavrl.networks import Denoiser, NetworkConfig, Spaces, make_denoiser
 from uavrl.networks.interfaces import Context
 
@@ -67,11 +67,7 @@ class DiffusionActor(nn.Module):
     ) -> Tensor:
         """x_0 (N, C + D) of the chain from `noise`, eq. (reverse_QL); the graph holds the last `gradient_steps`."""
         schedule, config = self.schedule(noise.start.device), self.config
-
-        def predict(vector: Tensor, step: Tensor) -> Tensor:
-            predicted: Tensor = denoiser(context, vector, step)
-            return predicted
-
+        predict = self._chain(denoiser, context, noise.start.device)
         if config.sampler == "ddim":
             return ddim(
                 predict,
@@ -92,6 +88,11 @@ class DiffusionActor(nn.Module):
             gradient_steps=gradient_steps,
         )
 
+    def _chain(self, denoiser: Denoiser, context: Context, device: torch.device) -> ChainDenoiser:
+        """The network as the samplers call it, with the parts of s and of all steps computed here, once."""
+        steps = denoiser.steps(torch.arange(1, self.config.steps + 1, device=device)).split(1)
+        return lambda vector, step: denoiser.predict(context, vector, steps[step - 1])
+
     @torch.no_grad()
     def act(self, context: Context, generator: torch.Generator, deterministic: bool) -> HybridAction:
         """One action a row by the average network; deterministic: DDIM from zero noise."""
@@ -99,11 +100,7 @@ class DiffusionActor(nn.Module):
         if deterministic:
             schedule = self.schedule(generator.device)
             start = torch.zeros((count, size), device=generator.device)
-
-            def predict(vector: Tensor, step: Tensor) -> Tensor:
-                predicted: Tensor = self.average(context, vector, step)
-                return predicted
-
+            predict = self._chain(self.average, context, generator.device)
             vector = ddim(predict, schedule, start, None, clip_x0=self.config.clip_x0)
         else:
             vector = self.sample(self.average, context, ChainNoise.draw(count, size, self.config.steps, generator))

@@ -34,6 +34,7 @@ from uavrl.agents.base import (
     adam,
     bellman_loss,
     discounts,
+    frozen,
     minimise,
     move_towards,
 )
@@ -228,11 +229,12 @@ class DiffusionSac(Agent):
         w, z = straight_through_clamp(vector[:, :continuous]), vector[:, continuous:]
         w = self._jittered(w, jitter)
         probability = functional.softmax(z / config.choice_temperature, dim=-1)
-        with torch.no_grad():
+        with frozen(self.critic):
             context = self.critic.encode(observation)
-        every = self.critic.all_choices(context, w).amin(dim=0)  # (B, D)
-        if config.guidance == "softmax":
-            q = self.critic.value(context, w, probability).amin(dim=0)
+            every = self.critic.all_choices(context, w).amin(dim=0)  # (B, D)
+            soft = self.critic.value(context, w, probability) if config.guidance == "softmax" else None
+        if soft is not None:
+            q = soft.amin(dim=0)
         else:
             weight = probability
             if config.guidance == "straight_through":
@@ -300,7 +302,6 @@ class DiffusionSac(Agent):
 
     def _best(self, critic: Critic, context: Context, action: HybridAction) -> tuple[Tensor, Tensor]:
         """(min Q, choice), each (B,), of w with its own choice, or with the best one where the config says so."""
-        q = critic.all_choices(context, action.continuous).amin(dim=0)
         if self.config.greedy_choice:
-            return q.max(dim=-1)
-        return q.gather(1, action.choice[:, None]).squeeze(1), action.choice
+            return critic.all_choices(context, action.continuous).amin(dim=0).max(dim=-1)
+        return action_value(critic, context, action, self.spaces.choices).amin(dim=0), action.choice

@@ -28,6 +28,7 @@ from uavrl.agents.base import (
     adam,
     bellman_loss,
     discounts,
+    frozen,
     minimise,
     move_towards,
 )
@@ -92,9 +93,8 @@ def soft_actor_loss(
     """-V(s) under the current critic; temperature (2,), noise (B, C). The metrics hold both entropies, (2,)."""
     output = actor(observation)
     sample = SquashedSample(output, noise)
-    with torch.no_grad():
-        context = critic.encode(observation)
-    q = critic.all_choices(context, sample.continuous).amin(dim=0)
+    with frozen(critic):
+        q = critic.all_choices(critic.encode(observation), sample.continuous).amin(dim=0)
     log_choice = output.logits.log_softmax(dim=-1)
     a_c, a_d = temperature
     loss = -soft_value(q, log_choice, sample.log_density, a_c, a_d).mean()

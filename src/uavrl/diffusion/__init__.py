@@ -1,6 +1,7 @@
 """Denoising diffusion: noise schedules, samplers and the denoising loss, for any denoiser."""
 
 from uavrl.diffusion.samplers import (
+    ChainDenoiser,
     Denoiser,
     Variance,
     add_noise,
@@ -15,6 +16,7 @@ from uavrl.diffusion.samplers import (
 from uavrl.diffusion.schedules import Schedule, ScheduleName, make_schedule, schedule_from_beta
 
 __all__ = [
+    "ChainDenoiser",
     "Denoiser",
     "Schedule",
     "ScheduleName",

@@ -18,6 +18,9 @@ from uavrl.diffusion.schedules import Schedule
 Denoiser = Callable[[Tensor, Tensor], Tensor]
 """x (N, D), step (N,) int64 in 1..M -> predicted noise (N, D)."""
 
+ChainDenoiser = Callable[[Tensor, int], Tensor]
+"""The same where all samples are at one step, as they are throughout a chain."""
+
 Variance = Literal["beta", "posterior"]
 
 _Update = Callable[[int, Tensor, Tensor], Tensor]  # i, x_i, x_0 -> x_{i-1}
@@ -69,7 +72,7 @@ class _Clamp(torch.autograd.Function):
 
 
 def ddpm(
-    denoiser: Denoiser,
+    denoiser: ChainDenoiser,
     schedule: Schedule,
     start: Tensor,
     noise: Tensor,
@@ -98,7 +101,7 @@ def ddpm(
 
 
 def ddim(
-    denoiser: Denoiser,
+    denoiser: ChainDenoiser,
     schedule: Schedule,
     start: Tensor,
     noise: Tensor | None,
@@ -128,7 +131,7 @@ def ddim(
     return _reverse(denoiser, schedule, start, update, clip_x0, gradient_steps)
 
 
-def dpm_solver_pp_2m(denoiser: Denoiser, schedule: Schedule, start: Tensor, *, clip_x0: bool) -> Tensor:
+def dpm_solver_pp_2m(denoiser: ChainDenoiser, schedule: Schedule, start: Tensor, *, clip_x0: bool) -> Tensor:
     """DPM-Solver++(2M) sample x_0 (N, D), a deterministic map of start (N, D) (Lu et al. 2022, algorithm 2).
 
     DDIM at ddim_eta 0 with x_0 extrapolated from its last two predictions, in the half log-SNR
@@ -179,7 +182,7 @@ def _scales(schedule: Schedule, step: Tensor, dtype: torch.dtype) -> tuple[Tenso
 
 
 def _predict_x0(x: Tensor, predicted_noise: Tensor, signal_scale: Tensor, noise_scale: Tensor, clip: bool) -> Tensor:
-    x0 = (x - noise_scale * predicted_noise) / signal_scale
+    x0 = torch.addcmul(x, noise_scale, predicted_noise, value=-1) / signal_scale
     return straight_through_clamp(x0) if clip else x0
 
 
@@ -200,13 +203,13 @@ def _affine(
     """The update x_weight x_i + x0_weight x_0 + noise_weight noise; weights (M-1,), noise (M-1, N, D), for i = 2..M."""
     x_weights, x0_weights = x_weight.to(dtype).unbind(), x0_weight.to(dtype).unbind()
     if noise is None or noise_weight is None:
-        return lambda i, x, x0: x_weights[i - 2] * x + x0_weights[i - 2] * x0
+        return lambda i, x, x0: torch.addcmul(x_weights[i - 2] * x, x0_weights[i - 2], x0)
     jitter = (noise_weight.to(dtype).view(-1, 1, 1) * noise).unbind()
-    return lambda i, x, x0: x_weights[i - 2] * x + x0_weights[i - 2] * x0 + jitter[i - 2]
+    return lambda i, x, x0: torch.addcmul(torch.addcmul(jitter[i - 2], x_weights[i - 2], x), x0_weights[i - 2], x0)
 
 
 def _reverse(
-    denoiser: Denoiser,
+    denoiser: ChainDenoiser,
     schedule: Schedule,
     start: Tensor,
     update: _Update,
@@ -221,11 +224,10 @@ def _reverse(
         )
     signal_scale = schedule.signal_scale.to(start.dtype).unbind()
     noise_scale = schedule.noise_scale.to(start.dtype).unbind()
-    numbers = torch.arange(1, steps + 1, device=start.device).unsqueeze(1).expand(steps, start.shape[0]).unbind()
 
     def walk(x: Tensor, order: range) -> Tensor:
         for i in order:
-            predicted_noise = denoiser(x, numbers[i - 1])
+            predicted_noise = denoiser(x, i)
             x0 = _predict_x0(x, predicted_noise, signal_scale[i - 1], noise_scale[i - 1], clip_x0)
             x = x0 if i == 1 else update(i, x, x0)
         return x

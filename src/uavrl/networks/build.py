@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
 from uavrl.errors import ConfigError
+from uavrl.networks.activations import ActivationName
 from uavrl.networks.devices import SetActor, SetChoiceActor, SetConditional, SetCritic, SetDenoiser
 from uavrl.networks.interfaces import Actor, ChoiceActor, Conditional, Critic, Denoiser, Observation
 from uavrl.networks.mlp import MlpActor, MlpChoiceActor, MlpConditional, MlpCritic, MlpDenoiser, Normaliser
@@ -34,7 +35,7 @@ class NetworkConfig(BaseModel):
     kind: Literal["mlp", "devices"] = Field("devices", description="perceptron, or a network over the set of devices")
     width: int = Field(64, ge=1, description="units of a hidden layer")
     depth: int = Field(3, ge=1, description="hidden layers of a perceptron")
-    activation: Literal["silu", "mish", "relu"] = Field("silu", description="of a perceptron")
+    activation: ActivationName = Field("silu", description="of a perceptron")
     layer_norm: bool = Field(False, description="layer normalisation in the critic")
     choice_heads: bool = Field(True, description="perceptron critic: one output a choice; false: choice is an input")
     log_inputs: bool = Field(True, description="perceptron: log(1 + |s|) of each entry beside the entry itself")

@@ -193,11 +193,15 @@ class SetDenoiser(Denoiser):
         tokens, globals_, valid, _ = features(observation, self.scale_m)
         return (*self.trunk.encode(tokens, globals_), valid)
 
-    def forward(self, context: Context, vector: Tensor, step: Tensor) -> Tensor:
+    def steps(self, step: Tensor) -> Tensor:
+        """Their embedding, (n, 16)."""
+        return step_embedding(step, self.embedding_size)
+
+    def predict(self, context: Context, vector: Tensor, step: Tensor) -> Tensor:
         """See `Denoiser`."""
         token, globals_, valid = context
         own, rest = vector[:, self.continuous + 1 :, None], vector[:, : self.continuous + 1]
-        whole = torch.cat([rest, step_embedding(step, self.embedding_size)], dim=-1)
+        whole = torch.cat([rest, step.expand(len(rest), -1)], dim=-1)
         hidden, whole = self.trunk(token, globals_, valid, own, whole)
         return torch.cat([self.global_out(whole), self.device_out(hidden).squeeze(-1)], dim=-1)
 

@@ -64,8 +64,16 @@ class Denoiser(nn.Module, ABC):
         """The observation's part."""
 
     @abstractmethod
+    def steps(self, step: Tensor) -> Tensor:
+        """The part of denoising steps 1..M (n,), first axis n; a chain computes it once for all of its steps."""
+
+    @abstractmethod
+    def predict(self, context: Context, vector: Tensor, step: Tensor) -> Tensor:
+        """Predicted noise (B, C + D) of a noisy diffusion vector (B, C + D) from B rows of `steps`, or 1 for all."""
+
     def forward(self, context: Context, vector: Tensor, step: Tensor) -> Tensor:
         """Predicted noise (B, C + D) of a noisy diffusion vector (B, C + D) at steps 1..M (B,)."""
+        return self.predict(context, vector, self.steps(step))
 
     @abstractmethod
     def vector_size(self, context: Context) -> int:

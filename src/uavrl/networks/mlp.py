@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from uavrl.networks.activations import ACTIVATIONS, Activation, ActivationName
 from uavrl.networks.interfaces import (
     Actor,
     ActorOutput,
@@ -56,25 +58,67 @@ class Normaliser(nn.Module):
         return normal
 
 
-def activation_layer(name: str) -> nn.Module:
-    """A fresh activation: "silu", "mish" or "relu"."""
-    return {"silu": nn.SiLU, "mish": nn.Mish, "relu": nn.ReLU}[name]()
+class _Layers(torch.autograd.Function):
+    """Activation and linear layer in turn, with the gradient written out.
+
+    A chain of M passes over small layers is mostly administration otherwise: one node in the graph takes the place of
+    four a layer.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, activation: Activation, first: Tensor, *weights: Tensor) -> Tensor:
+        """From (B, width) before the first activation; weights W_1, b_1, W_2, b_2, ... as in nn.Linear."""
+        wanted, kept, out = any(ctx.needs_input_grad), [], first
+        for matrix, bias in zip(weights[::2], weights[1::2], strict=True):
+            hidden, slope = activation(out, wanted)
+            kept += [hidden, slope]
+            out = torch.addmm(bias, hidden, matrix.T)
+        if wanted:
+            ctx.save_for_backward(*kept, *weights[::2])
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        layers = len(ctx.saved_tensors) // 3
+        kept, matrices = ctx.saved_tensors[: 2 * layers], ctx.saved_tensors[2 * layers :]
+        found: list[Tensor | None] = []
+        for layer in reversed(range(layers)):
+            trains_matrix, trains_bias = ctx.needs_input_grad[2 + 2 * layer : 4 + 2 * layer]
+            found = [
+                gradient.T @ kept[2 * layer] if trains_matrix else None,
+                gradient.sum(dim=0) if trains_bias else None,
+                *found,
+            ]
+            gradient = (gradient @ matrices[layer]).mul_(kept[2 * layer + 1])
+        return None, gradient, *found
 
 
-def hidden_layers(width: int, depth: int, activation: str, layer_norm: bool) -> nn.Sequential:
-    """What follows the first linear layer: activation, then depth - 1 further hidden layers."""
-    layers: list[nn.Module] = [nn.LayerNorm(width)] if layer_norm else []
-    layers.append(activation_layer(activation))
-    for _ in range(depth - 1):
-        layers.append(nn.Linear(width, width))
-        if layer_norm:
-            layers.append(nn.LayerNorm(width))
-        layers.append(activation_layer(activation))
-    return nn.Sequential(*layers)
+class Layers(nn.Module):
+    """What follows a perceptron's first linear layer: its activation, depth - 1 hidden layers, and the output layer."""
+
+    def __init__(self, width: int, depth: int, outputs: int, activation: ActivationName, layer_norm: bool) -> None:
+        super().__init__()
+        self.activation = ACTIVATIONS[activation]
+        self.hidden = nn.ModuleList(nn.Linear(width, width) for _ in range(depth - 1))
+        self.out = nn.Linear(width, outputs)
+        self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(depth)) if layer_norm else None
+
+    def forward(self, first: Tensor) -> Tensor:
+        """(B, width) as the first linear layer gives it -> (B, outputs)."""
+        weights = [part for linear in (*self.hidden, self.out) for part in (linear.weight, linear.bias)]
+        if self.norms is None:
+            return self._run(first, *weights)
+        for norm, matrix, bias in zip(self.norms, weights[::2], weights[1::2], strict=True):
+            first = self._run(norm(first), matrix, bias)
+        return first
+
+    def _run(self, first: Tensor, *weights: Any) -> Tensor:
+        out: Tensor = _Layers.apply(self.activation, first, *weights)  # type: ignore[no-untyped-call]  # torch's own
+        return out
 
 
 def step_embedding(step: Tensor, size: int) -> Tensor:
-    """Sinusoidal embedding of the denoising step (B,) -> (B, size) (Vaswani et al. 2017)."""
+    """Sinusoidal embedding of denoising steps (n,) -> (n, size) (Vaswani et al. 2017)."""
     frequency = torch.exp(torch.arange(size // 2, device=step.device) * (-math.log(1e4) / (size // 2 - 1)))
     angle = step[:, None].float() * frequency
     return torch.cat([torch.sin(angle), torch.cos(angle)], dim=-1)
@@ -90,29 +134,37 @@ class _MlpQ(nn.Module):
     """One Q function. `heads`: one output a choice; else d is an input, as in the paper."""
 
     def __init__(
-        self, size: int, continuous: int, choices: int, heads: bool, width: int, depth: int, activation: str, norm: bool
+        self,
+        size: int,
+        continuous: int,
+        choices: int,
+        heads: bool,
+        width: int,
+        depth: int,
+        activation: ActivationName,
+        layer_norm: bool,
     ) -> None:
         super().__init__()
         self.observation = nn.Linear(size, width)
         self.continuous = nn.Linear(continuous, width, bias=False)
         self.choice = None if heads else nn.Linear(choices, width, bias=False)
-        self.hidden = hidden_layers(width, depth, activation, norm)
-        self.out = nn.Linear(width, choices if heads else 1)
+        self.rest = Layers(width, depth, choices if heads else 1, activation, layer_norm)
 
     def all_choices(self, context: Tensor, continuous: Tensor) -> Tensor:
         first = context + self.continuous(continuous)
         if self.choice is None:
-            q: Tensor = self.out(self.hidden(first))
+            q: Tensor = self.rest(first)
         else:
-            q = self.out(self.hidden(first[:, None] + self.choice.weight.T)).squeeze(-1)
+            rows = (first[:, None] + self.choice.weight.T).flatten(0, 1)
+            q = self.rest(rows).view(len(first), -1)
         return q
 
     def value(self, context: Tensor, continuous: Tensor, choice: Tensor) -> Tensor:
         first = context + self.continuous(continuous)
         if self.choice is None:
-            q: Tensor = (self.out(self.hidden(first)) * choice).sum(dim=-1)
+            q: Tensor = (self.rest(first) * choice).sum(dim=-1)
         else:
-            q = self.out(self.hidden(first + self.choice(choice))).squeeze(-1)
+            q = self.rest(first + self.choice(choice)).squeeze(-1)
         return q
 
 
@@ -129,7 +181,7 @@ class MlpCritic(Critic):
         log: bool,
         width: int,
         depth: int,
-        activation: str,
+        activation: ActivationName,
         layer_norm: bool,
     ) -> None:
         super().__init__()
@@ -158,14 +210,14 @@ class MlpCritic(Critic):
     def shift(self, amount: float) -> None:
         """See `Critic`."""
         for q in (self.first, self.second):
-            q.out.bias.add_(amount)
+            q.rest.out.bias.add_(amount)
 
 
 class MlpDenoiser(Denoiser):
     """Perceptron over [s, a^i, embedding of i]."""
 
     def __init__(
-        self, size: int, vector: int, *, log: bool, width: int, depth: int, activation: str, layer_norm: bool
+        self, size: int, vector: int, *, log: bool, width: int, depth: int, activation: ActivationName, layer_norm: bool
     ) -> None:
         super().__init__()
         self.normaliser = Normaliser(size, log)
@@ -174,17 +226,21 @@ class MlpDenoiser(Denoiser):
         self.observation = nn.Linear(self.normaliser.size, width)
         self.action = nn.Linear(vector, width, bias=False)
         self.step = nn.Linear(self.embedding_size, width, bias=False)
-        self.hidden = hidden_layers(width, depth, activation, layer_norm)
-        self.out = nn.Linear(width, vector)
+        self.rest = Layers(width, depth, vector, activation, layer_norm)
 
     def encode(self, observation: Observation) -> Context:
         """The first layer's observation part."""
         return (self.observation(self.normaliser(_flat(observation))),)
 
-    def forward(self, context: Context, vector: Tensor, step: Tensor) -> Tensor:
+    def steps(self, step: Tensor) -> Tensor:
+        """The first layer's step part, (n, width)."""
+        part: Tensor = self.step(step_embedding(step, self.embedding_size))
+        return part
+
+    def predict(self, context: Context, vector: Tensor, step: Tensor) -> Tensor:
         """See `Denoiser`."""
-        first = context[0] + self.action(vector) + self.step(step_embedding(step, self.embedding_size))
-        noise: Tensor = self.out(self.hidden(first))
+        first = torch.addmm(context[0] + step, vector, self.action.weight.T)
+        noise: Tensor = self.rest(first)
         return noise
 
     def vector_size(self, context: Context) -> int:
@@ -204,20 +260,19 @@ class MlpActor(Actor):
         log: bool,
         width: int,
         depth: int,
-        activation: str,
+        activation: ActivationName,
         layer_norm: bool,
     ) -> None:
         super().__init__()
         self.normaliser = Normaliser(size, log)
         self.sizes = (continuous, continuous, choices)
         self.first = nn.Linear(self.normaliser.size, width)
-        self.hidden = hidden_layers(width, depth, activation, layer_norm)
-        self.out = nn.Linear(width, sum(self.sizes))
+        self.rest = Layers(width, depth, sum(self.sizes), activation, layer_norm)
 
     def forward(self, observation: Observation) -> ActorOutput:
         """See `Actor`."""
-        hidden = self.hidden(self.first(self.normaliser(_flat(observation))))
-        mean, log_std, logits = self.out(hidden).split(self.sizes, dim=-1)
+        raw = self.rest(self.first(self.normaliser(_flat(observation))))
+        mean, log_std, logits = raw.split(self.sizes, dim=-1)
         return ActorOutput(mean, bounded_log_std(log_std), logits)
 
 
@@ -233,20 +288,19 @@ class MlpChoiceActor(ChoiceActor):
         log: bool,
         width: int,
         depth: int,
-        activation: str,
+        activation: ActivationName,
         layer_norm: bool,
     ) -> None:
         super().__init__()
         self.normaliser = Normaliser(size, log)
         self.continuous = continuous
         self.first = nn.Linear(self.normaliser.size, width)
-        self.hidden = hidden_layers(width, depth, activation, layer_norm)
-        self.out = nn.Linear(width, choices * (1 + 2 * continuous))
+        self.rest = Layers(width, depth, choices * (1 + 2 * continuous), activation, layer_norm)
 
     def forward(self, observation: Observation) -> ChoiceActorOutput:
         """See `ChoiceActor`."""
-        hidden = self.hidden(self.first(self.normaliser(_flat(observation))))
-        return choice_output(self.out(hidden).unflatten(-1, (-1, 1 + 2 * self.continuous)))
+        raw = self.rest(self.first(self.normaliser(_flat(observation))))
+        return choice_output(raw.unflatten(-1, (-1, 1 + 2 * self.continuous)))
 
 
 class MlpConditional(Conditional):
@@ -262,7 +316,7 @@ class MlpConditional(Conditional):
         log: bool,
         width: int,
         depth: int,
-        activation: str,
+        activation: ActivationName,
         layer_norm: bool,
     ) -> None:
         super().__init__()
@@ -270,8 +324,7 @@ class MlpConditional(Conditional):
         self.observation = nn.Linear(self.normaliser.size, width)
         self.inputs = nn.Linear(inputs, width, bias=False) if inputs else None
         self.choice = nn.Linear(choices, width, bias=False) if choices else None
-        self.hidden = hidden_layers(width, depth, activation, layer_norm)
-        self.out = nn.Linear(width, outputs)
+        self.rest = Layers(width, depth, outputs, activation, layer_norm)
 
     def encode(self, observation: Observation) -> Context:
         """The first layer's observation part."""
@@ -284,7 +337,7 @@ class MlpConditional(Conditional):
             first = first + self.inputs(inputs)
         if self.choice is not None:
             first = first + self.choice(choice)
-        outputs: Tensor = self.out(self.hidden(first))
+        outputs: Tensor = self.rest(first)
         return outputs
 
 
