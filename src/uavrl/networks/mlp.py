@@ -68,14 +68,13 @@ class _Layers(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, activation: Activation, first: Tensor, *weights: Tensor) -> Tensor:
         """From (B, width) before the first activation; weights W_1, b_1, W_2, b_2, ... as in nn.Linear."""
-        wanted, kept, out = any(ctx.needs_input_grad), [], first
+        kept: list[Tensor | None] = []
         for matrix, bias in zip(weights[::2], weights[1::2], strict=True):
-            hidden, slope = activation(out, wanted)
+            hidden, slope = activation(first, True)
             kept += [hidden, slope]
-            out = torch.addmm(bias, hidden, matrix.T)
-        if wanted:
-            ctx.save_for_backward(*kept, *weights[::2])
-        return out
+            first = torch.addmm(bias, hidden, matrix.T)
+        ctx.save_for_backward(*kept, *weights[::2])
+        return first
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
@@ -113,8 +112,12 @@ class Layers(nn.Module):
         return first
 
     def _run(self, first: Tensor, *weights: Any) -> Tensor:
-        out: Tensor = _Layers.apply(self.activation, first, *weights)  # type: ignore[no-untyped-call]  # torch's own
-        return out
+        if torch.is_grad_enabled():
+            out: Tensor = _Layers.apply(self.activation, first, *weights)  # type: ignore[no-untyped-call]  # torch's own
+            return out
+        for matrix, bias in zip(weights[::2], weights[1::2], strict=True):
+            first = torch.addmm(bias, self.activation(first, False)[0], matrix.T)
+        return first
 
 
 def step_embedding(step: Tensor, size: int) -> Tensor:
