@@ -42,4 +42,4 @@ def test_a_single_environment_flies_on_over_an_episodes_end() -> None:
     single.fly()
     flown = single.environment.unwrapped
     assert isinstance(flown, DataCollectionEnv)
-    assert flown.state.step[0] == SINGLE_ACTIONS % 100
+    assert flown.state.step == SINGLE_ACTIONS % 100

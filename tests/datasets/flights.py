@@ -50,7 +50,7 @@ def fly(
         state = SimState(
             **{
                 name: np.where(done[:, None] if value.ndim == 2 else done, getattr(fresh, name), value)
-                for name, value in vars(after).items()
+                for name, value in after._asdict().items()
             }
         )
     return log.to_transitions()

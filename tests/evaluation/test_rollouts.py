@@ -24,7 +24,7 @@ def equal(first: Flights, second: Flights) -> bool:
 
 def one_draw(environments: EvaluationSet, flight: int, step: int) -> Draws:
     block = environments.draws(step // 64, np.ones(environments.flights, dtype=bool))
-    return Draws(block.scatter[step % 64, [flight]], block.sight[step % 64, [flight]])
+    return Draws(block.scatter[step % 64, flight], float(block.sight[step % 64, flight]))
 
 
 @pytest.mark.parametrize("scenario", ["released", "realistic"])
@@ -43,7 +43,7 @@ def test_every_flight_equals_the_environments_episode_for_equal_draws(
         episode = flights.episode(flight)
         for step in range(episode.steps):
             draws = one_draw(environments, flight, step)
-            monkeypatch.setattr("uavrl.simulation.environment.draw", lambda generator, count, draws=draws: draws)
+            monkeypatch.setattr("uavrl.simulation.environment.draw", lambda generator, draws=draws: draws)
             action = {"displacement_m": (9.0, -4.0), "device": (1, 0, 3, 4, 2)[step % 5]}
             _, reward, terminated, truncated, info = env.step(action)
             assert reward == pytest.approx(episode.reward[step], rel=1e-12)

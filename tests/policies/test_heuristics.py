@@ -24,7 +24,7 @@ def view_at(
     step: int = 0,
 ) -> SimulatorView:
     state = initial_state(np.array([position]), 3)
-    state = SimState(**{**vars(state), "age_s": np.array([age]), "step": np.array([step])})
+    state = state._replace(age_s=np.array([age]), step=np.array([step]))
     return SimulatorView(scenario, LAYOUT, state)
 
 

@@ -70,7 +70,7 @@ def test_rollouts_equal_the_simulator_where_nothing_is_random(name: str) -> None
     scenario, generator = DETERMINISTIC[name], np.random.default_rng(2)
     layout, start = layouts_and_starts(scenario, 24, 3)
     state = initial_state(start, scenario.traffic.devices)
-    state = replace(state, age_s=generator.uniform(0, 1.4, state.age_s.shape), step=np.full(24, 5))
+    state = state._replace(age_s=generator.uniform(0, 1.4, state.age_s.shape), step=np.full(24, 5))
     plan = some_plans(24, start, generator)
     tolerance = 1e-2 if name == "lost" else 1e-3  # the tables blur the edge of the range
     rolled = Rollouts(scenario).cost(layout, state, plan)
@@ -102,14 +102,14 @@ def test_the_planner_comes_near_the_best_of_all_sequences(preset: str) -> None:
     layout, start = layouts_and_starts(scenario, 1, 4)
     sequences = np.array(list(itertools.product(range(3), repeat=7)))
     count = len(sequences)
-    state = replace(initial_state(np.repeat(start, count, axis=0), 2), age_s=np.full((count, 2), 2.0))
+    state = initial_state(np.repeat(start, count, axis=0), 2)._replace(age_s=np.full((count, 2), 2.0))
     total = np.zeros(count)
     for step in range(7):
         action = FlightAction(np.zeros((count, 2)), sequences[:, step])
         draws = Draws(np.zeros((count, 2)), np.zeros(count))
         state, outcome = advance(scenario, np.repeat(layout, count, axis=0), state, action, draws)
         total += outcome.reward
-    planner, state, reached = make_policy("planner"), replace(initial_state(start, 2), age_s=np.full((1, 2), 2.0)), 0.0
+    planner, state, reached = make_policy("planner"), initial_state(start, 2)._replace(age_s=np.full((1, 2), 2.0)), 0.0
     planner.reset(1)
     for _ in range(7):
         action = planner.act(SimulatorView(scenario, layout, state), generator=np.random.default_rng(0))

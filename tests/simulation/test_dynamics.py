@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -64,14 +63,14 @@ def still(count: int) -> Draws:
 def go(scenario: Scenario, displacement: Any, device: int, **state_changes: Any) -> tuple[SimState, Outcome]:
     """One step of one flight from the middle, |h|^2 = 1 under Rayleigh fading."""
     layout, state = flights(scenario)
-    state = SimState(**(vars(state) | state_changes))
+    state = SimState(**(state._asdict() | state_changes))
     action = FlightAction(np.array([displacement], dtype=float), np.array([device]))
     return advance(scenario, layout, state, action, still(1))
 
 
 def to_torch(value: Any, dtype: torch.dtype) -> Any:
     if isinstance(value, SimState | Draws):
-        return type(value)(**{name: to_torch(entry, dtype) for name, entry in vars(value).items()})
+        return type(value)(**{name: to_torch(entry, dtype) for name, entry in value._asdict().items()})
     if isinstance(value, FlightAction):
         return FlightAction(*(to_torch(entry, dtype) for entry in value))
     tensor = torch.from_numpy(np.array(value))
@@ -97,7 +96,7 @@ class TestAgainstPlainPython:
                 float(draws.sight[n]),
                 float(measured[n]),
             )
-            got = vars(outcome) | {"position_m": after.position_m, "age_s": after.age_s}
+            got = outcome._asdict() | {"position_m": after.position_m, "age_s": after.age_s}
             for key, value in expected.items():
                 assert got[key][n] == pytest.approx(value, rel=1e-6, abs=1e-9), f"flight {n}: {key}"
 
@@ -110,7 +109,7 @@ class TestAgainstPlainPython:
         assert (action.device == 0).any()
         held = (action.displacement_m != 0).any(axis=1) & (after.position_m == state.position_m).all(axis=1)
         assert held.any()
-        assert {"terminated", "truncated"} <= {field.name for field in fields(Outcome)}
+        assert {"terminated", "truncated"} <= set(Outcome._fields)
 
     @every_scenario
     def test_clocks_and_energies_add_up(self, name: str) -> None:
@@ -140,7 +139,7 @@ class TestLibraries:
         single = [to_torch(value, torch.float32) for value in (layout, state, action, draws, measured)]
         got_state, got = advance(scenario, *single)
         for left, right in ((expected_state, got_state), (expected, got)):
-            for key, value in vars(left).items():
+            for key, value in left._asdict().items():
                 tensor = getattr(right, key)
                 if value.dtype == bool:
                     assert tensor.dtype == torch.bool, key
@@ -173,7 +172,7 @@ class TestLibraries:
         # inside the disc and the area, away from where the step is not smooth
         state = SimState(
             **(
-                vars(state)
+                state._asdict()
                 | {"position_m": 0.4 * state.position_m + 0.3 * min(scenario.area.width_m, scenario.area.depth_m)}
             )
         )
@@ -217,9 +216,9 @@ class TestProperties:
         assert ((after.age_s >= 0) & (after.age_s <= scenario.traffic.max_age_s)).all()
         for key in ("duration_s", "move_s", "transmission_s", "snr", "rate_bps", "bits", "age_term", "energy_term"):
             assert (getattr(outcome, key) >= 0).all(), key
-        for field in fields(Outcome):
-            if field.name.endswith("_j"):
-                assert (getattr(outcome, field.name) >= 0).all(), field.name
+        for field in Outcome._fields:
+            if field.endswith("_j"):
+                assert (getattr(outcome, field) >= 0).all(), field
         assert (outcome.reward <= 0).all()
         reach = scenario.airframe.max_displacement_m
         assert (np.hypot(*outcome.displacement_m.T) <= reach * (1 + 1e-12)).all()
@@ -237,20 +236,41 @@ class TestProperties:
             _, alone = advance(
                 scenario,
                 layout[one],
-                SimState(**{key: value[one] for key, value in vars(state).items()}),
+                SimState(**{key: value[one] for key, value in state._asdict().items()}),
                 FlightAction(action.displacement_m[one], action.device[one]),
                 Draws(draws.scatter[one], draws.sight[one]),
                 measured[one],
             )
-            for key, value in vars(alone).items():
+            for key, value in alone._asdict().items():
                 assert getattr(together, key)[n] == pytest.approx(value[0], rel=1e-12, abs=1e-300), key
+
+    @every_scenario
+    def test_one_flight_without_the_batchs_axis_is_the_same_flight(self, name: str) -> None:
+        """Python's functions of a number and NumPy's differ in the last digit."""
+        scenario = SCENARIOS[name]
+        layout, state, action, draws, measured = situation(scenario, 60, seed=4)
+        after, together = advance(scenario, layout, state, action, draws, measured)
+        for n in range(60):
+            one, alone = advance(
+                scenario,
+                layout[n],
+                SimState(*(value[n] if value.ndim == 2 else value[n].item() for value in state)),
+                FlightAction(action.displacement_m[n], int(action.device[n])),
+                Draws(draws.scatter[n], float(draws.sight[n])),
+                float(measured[n]),
+            )
+            for wanted, found in ((after, one), (together, alone)):
+                for key, value in found._asdict().items():
+                    assert value == pytest.approx(getattr(wanted, key)[n], rel=1e-9, abs=1e-12), key
+            assert {type(value) for value in one} == {np.ndarray, float, int}
+            assert all(isinstance(value, (np.ndarray, float, bool)) for value in alone)
 
     def test_nothing_given_is_written_to(self) -> None:
         scenario = load_scenario("realistic")
         given_ = situation(scenario, 20)
-        before = [np.copy(x) for x in (given_[0], *vars(given_[1]).values(), *given_[2], *vars(given_[3]).values())]
+        before = [np.copy(x) for x in (given_[0], *given_[1], *given_[2], *given_[3])]
         advance(scenario, *given_)
-        after = [given_[0], *vars(given_[1]).values(), *given_[2], *vars(given_[3]).values()]
+        after = [given_[0], *given_[1], *given_[2], *given_[3]]
         assert all(np.array_equal(left, right) for left, right in zip(before, after, strict=True))
 
     def test_initial_state_is_fresh(self) -> None:

@@ -75,7 +75,7 @@ class TestContract:
         unwrapped = made.unwrapped
         assert isinstance(unwrapped, DataCollectionEnv)
         assert unwrapped.scenario == load_scenario("released", fading="none")
-        assert unwrapped.layout_m[0].tolist() == LAYOUT.tolist()
+        assert unwrapped.layout_m.tolist() == LAYOUT.tolist()
 
     def test_spaces_are_metres_seconds_joules(self) -> None:
         made = DataCollectionEnv("paper", max_displacement_m=30.0)
@@ -117,7 +117,7 @@ class TestContract:
         info["age_s"][:] = 77.0
         info["layout_m"][:] = 77.0
         assert env.state.age_s.tolist() == before.tolist()
-        assert env.layout_m[0].tolist() == LAYOUT.tolist()
+        assert env.layout_m.tolist() == LAYOUT.tolist()
 
     def test_episode_ends_by_truncation(self) -> None:
         env = DataCollectionEnv("released", LAYOUT, max_steps=3)
@@ -180,7 +180,7 @@ class TestMistakes:
             ([[0.0, 0.0]] * 9 + [[-1.0, 0.0]], "layout[9, 0] = -1 lies outside"),
             ([[0.0, 0.0]] * 9 + [[0.0]], "layout is no array of numbers"),
             ("here", "layout is no array of numbers"),
-            (np.zeros((2, 10, 2)), "layout has shape (2, 10, 2), allowed: (K, 2) or (1, K, 2)"),
+            (np.zeros((2, 10, 2)), "layout has shape (2, 10, 2), allowed: (10, 2)"),
         ],
     )
     def test_a_layout(self, layout: Any, message: str) -> None:
@@ -279,13 +279,13 @@ class TestVector:
         drawn = [Draws(generator.standard_normal((3, 2)), generator.random(3)) for _ in range(60)]
         acts = [actions(generator, 3) for _ in range(60)]
         stream = iter(drawn)
-        monkeypatch.setattr(environment, "draw", lambda _generator, _count: next(stream))
+        monkeypatch.setattr(environment, "draw", lambda _generator, *_count: next(stream))
 
         vector = DataCollectionVectorEnv(3, scenario, layouts, max_steps=60)
         vector.reset(seed=0, options={"position_m": starts})
         together = [vector.step(one) for one in acts]
         for n in range(3):
-            stream = iter(Draws(d.scatter[n : n + 1], d.sight[n : n + 1]) for d in drawn)
+            stream = iter(Draws(d.scatter[n], float(d.sight[n])) for d in drawn)
             single = DataCollectionEnv(scenario, layouts[n], max_steps=60)
             single.reset(seed=9, options={"position_m": starts[n]})
             for one, (observation, rewards, terminations, truncations, infos) in zip(acts, together, strict=True):

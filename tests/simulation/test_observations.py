@@ -60,7 +60,7 @@ def test_equal_priorities_read_one_and_no_battery_reads_full() -> None:
 
 
 def test_torch_sees_the_same() -> None:
-    tensors = {name: torch.from_numpy(np.asarray(value)) for name, value in vars(STATE).items()}
+    tensors = {name: torch.from_numpy(np.asarray(value)) for name, value in STATE._asdict().items()}
     layout = torch.from_numpy(LAYOUT)
     paper = paper_observation(tensors["position_m"], tensors["age_s"], tensors["energy_j"])
     assert paper.numpy() == pytest.approx(observe("paper", SCENARIO, LAYOUT, STATE))
@@ -74,7 +74,7 @@ def test_torch_sees_the_same() -> None:
 @pytest.mark.parametrize("kind", ["paper", "devices"])
 def test_space_holds_what_is_seen_up_to_its_bounds(kind: str) -> None:
     space = observation_space(kind, SCENARIO)  # type: ignore[arg-type]  # a test's parameter is a plain string
-    edge = SimState(**(vars(STATE) | {"age_s": np.full((2, 3), 400.0), "position_m": np.array([[1e3, 1e3], [0, 0.0]])}))
+    edge = STATE._replace(age_s=np.full((2, 3), 400.0), position_m=np.array([[1e3, 1e3], [0, 0.0]]))
     layout = np.array([[[0.0, 0.0], [1000.0, 1000.0], [0.0, 1000.0]]] * 2)
     for state in (STATE, edge):
         seen = observe(kind, SCENARIO, layout, state)  # type: ignore[arg-type]  # as above

@@ -111,7 +111,7 @@ def test_the_environment_renders_the_state_it_is_in() -> None:
     assert still is not None
     assert frame is not None
     assert (still != frame).any()
-    assert (frame == draw_frame(env.scenario, LAYOUT, path, env.state.age_s[0], 2)).all()
+    assert (frame == draw_frame(env.scenario, LAYOUT, path, env.state.age_s, 2)).all()
 
 
 def test_pyplot_stays_out() -> None:

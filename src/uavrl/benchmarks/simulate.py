@@ -78,8 +78,7 @@ def step_bytes(scenario: Scenario) -> int:
     after, outcome = advance(scenario, np.zeros((1, devices, 2)), state, action, draws)
 
     def size(*parts: SimState | FlightAction | Draws | Outcome) -> int:
-        fields = [part._asdict() if isinstance(part, FlightAction) else vars(part) for part in parts]
-        return sum(int(np.asarray(value).nbytes) for values in fields for value in values.values())
+        return sum(int(np.asarray(value).nbytes) for part in parts for value in part)
 
     served_position = 2 * 8  # of the whole layout a step needs one device's place
     return size(state, action, draws, after, outcome) + served_position

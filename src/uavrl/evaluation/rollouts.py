@@ -377,7 +377,7 @@ def _keep_ended(before: SimState, after: SimState, active: Bool) -> SimState:
     return SimState(
         **{
             field: np.where(row if value.ndim == 2 else active, getattr(after, field), value)
-            for field, value in vars(before).items()
+            for field, value in before._asdict().items()
         }
     )
 

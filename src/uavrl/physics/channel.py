@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from uavrl.physics.arrays import Array, array_namespace
+from uavrl.physics.arrays import Array, array_namespace, components
 from uavrl.scenario import Channel
 
 # (a, b, eta_LoS dB, eta_NLoS dB) of Al-Hourani, Kandeepan & Lardner 2014, "Optimal LAP altitude for maximum coverage"
@@ -88,16 +88,18 @@ def fading_power(normal: Array, factor: Array) -> Array:
         normal: (..., 2) standard normal draws, real and imaginary part.
         factor: (...) Rician factor (ratio).
     """
-    xp = array_namespace(normal)
+    xp = array_namespace(factor)
+    first, second = components(normal)
     scatter = xp.sqrt(0.5 / (factor + 1.0))
-    real = xp.sqrt(factor / (factor + 1.0)) + scatter * normal[..., 0]
-    imaginary = scatter * normal[..., 1]
+    real = xp.sqrt(factor / (factor + 1.0)) + scatter * first
+    imaginary = scatter * second
     return real * real + imaginary * imaginary
 
 
 def rayleigh_power(normal: Array) -> Array:
     """|h|^2 of Rayleigh fading, exponential with unit mean: `fading_power` with factor 0; arguments as there."""
-    return 0.5 * (normal[..., 0] * normal[..., 0] + normal[..., 1] * normal[..., 1])
+    real, imaginary = components(normal)
+    return 0.5 * (real * real + imaginary * imaginary)
 
 
 def rate_bps(snr: Array, bandwidth_hz: float) -> Array:
@@ -108,6 +110,8 @@ def rate_bps(snr: Array, bandwidth_hz: float) -> Array:
 
 def ergodic_rate_bps(snr: Array, bandwidth_hz: float) -> Array:
     """Mean of eq. (rate) over Rayleigh fading, B e^(1/gamma) E1(1/gamma) / ln 2 (bit/s), by quadrature."""
+    if isinstance(snr, float):
+        return float(ergodic_rate_bps(np.asarray(snr), bandwidth_hz))
     xp = array_namespace(snr)
     nodes = xp.asarray(_EXPONENTIAL_NODES, dtype=snr.dtype, device=snr.device)
     weights = xp.asarray(_EXPONENTIAL_WEIGHTS, dtype=snr.dtype, device=snr.device)

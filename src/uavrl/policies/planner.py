@@ -304,7 +304,7 @@ def _pairs(first: Float, second: NDArray[Any]) -> tuple[Float, NDArray[Any]]:
 def _costs(rollouts: Rollouts, view: SimulatorView, plans: Plan, first: FlightAction | None = None) -> Float:
     """Expected cost of C plans a flight (fields (N, C, ...)), each after its first action, (N, C)."""
     count, each = plans.wait.shape
-    state = SimState(**{key: np.repeat(value, each, axis=0) for key, value in vars(view.state).items()})
+    state = SimState(**{key: np.repeat(value, each, axis=0) for key, value in view.state._asdict().items()})
     flat = plans.map(lambda value: value.reshape(count * each, *value.shape[2:]))
     if first is not None:
         first = FlightAction(first.displacement_m.reshape(-1, 2), first.device.reshape(-1))

@@ -1,9 +1,13 @@
-"""The simulator's one step: a pure function of arrays, batch first, without random numbers inside."""
+"""The simulator's one step: a pure function of arrays, batch first, without random numbers inside.
+
+One environment alone steps several times as fast without the batch's axis: ages (K,), vectors (2,), all else Python's
+own numbers. Every function here takes either.
+"""
 
 from __future__ import annotations
 
 from uavrl.physics import age, channel, energy
-from uavrl.physics.arrays import Array, array_namespace, length
+from uavrl.physics.arrays import Array, array_namespace, components, length, per_device
 from uavrl.scenario import Area, Scenario, hover_reference_j
 from uavrl.simulation.state import Draws, FlightAction, Outcome, SimState
 
@@ -18,46 +22,63 @@ def initial_state(position_m: Array, devices: int) -> SimState:
     return SimState(position_m=position_m, age_s=ages, energy_j=zero, used_j=zero, time_s=zero, step=steps)
 
 
-def _fly(position_m: Array, displacement_m: Array, d_max: float, area: Area) -> Array:
-    """Position after a move of at most d_max under the scenario's border rule (N, 2) (m)."""
-    xp = array_namespace(position_m)
-    scale = d_max / xp.maximum(length(displacement_m), d_max)
-    target = position_m + displacement_m * scale[:, None]
-    size = xp.asarray([area.width_m, area.depth_m], dtype=position_m.dtype, device=position_m.device)
-    clipped = xp.minimum(xp.maximum(target, 0.0), size)
+def _fly(x: Array, y: Array, displacement_m: Array, d_max: float, area: Area) -> tuple[Array, Array]:
+    """Coordinates after a move of at most d_max under the scenario's border rule (m)."""
+    xp = array_namespace(x)
+    dx, dy = components(displacement_m)
+    scale = d_max / xp.maximum(length(dx, dy), d_max)
+    to_x, to_y = x + dx * scale, y + dy * scale
+    clipped_x = xp.minimum(xp.maximum(to_x, 0.0), area.width_m)
+    clipped_y = xp.minimum(xp.maximum(to_y, 0.0), area.depth_m)
     if area.border == "clip":
-        return clipped
-    inside = clipped == target
+        return clipped_x, clipped_y
+    inside_x, inside_y = clipped_x == to_x, clipped_y == to_y
     if area.border == "reflect":
-        return xp.where(inside, target, size - xp.abs(xp.remainder(target, 2.0 * size) - size))
-    inside = inside[:, :1] & inside[:, 1:]  # "mirroring" in the paper: the whole move is cancelled at no cost
-    return xp.where(inside, target, position_m)
+        width, depth = area.width_m, area.depth_m
+        reflected_x = width - xp.abs(xp.remainder(to_x, 2.0 * width) - width)
+        reflected_y = depth - xp.abs(xp.remainder(to_y, 2.0 * depth) - depth)
+        return xp.where(inside_x, to_x, reflected_x), xp.where(inside_y, to_y, reflected_y)
+    inside = inside_x & inside_y  # "mirroring" in the paper: the whole move is cancelled at no cost
+    return xp.where(inside, to_x, x), xp.where(inside, to_y, y)
 
 
-def _transmit(
-    scenario: Scenario, device_m: Array, position_m: Array, index: Array, draws: Draws
-) -> tuple[Array, Array, Array]:
-    """(snr, rate in bit/s, packet in bits) of the wanted link, (N,) or one number; idle rows mean nothing."""
-    xp = array_namespace(position_m)
+def _place(layout_m: Array, index: Array) -> Array:
+    """Positions (N, 2) of one device (N,) in each layout (N, K, 2); or without N."""
+    if layout_m.ndim == 2:
+        return layout_m[index]
+    xp = array_namespace(layout_m)
+    # one flat index into N x K is looked up several times as fast as a pair of indices
+    rows = xp.arange(index.shape[0], device=index.device)
+    return xp.take(layout_m.reshape((-1, 2)), rows * layout_m.shape[1] + index, axis=0)
+
+
+def _packet_bits(scenario: Scenario, index: Array, like: Array) -> Array:
+    """Packet size of a device (N,) or, where all are alike, one number (bit)."""
+    bits = scenario.traffic.packet_bits
+    if not isinstance(bits, tuple):
+        return bits
+    if isinstance(index, int):
+        return bits[index]
+    return array_namespace(like).asarray(bits, dtype=like.dtype, device=like.device)[index]
+
+
+def _transmit(scenario: Scenario, horizontal_m: Array, draws: Draws) -> tuple[Array, Array]:
+    """(snr, rate in bit/s) of a link, each (N,); idle rows mean nothing."""
+    xp = array_namespace(horizontal_m)
     link = scenario.channel
-    elevation, los, snr = channel.link_snr(length(device_m - position_m), link)
+    elevation, los, snr = channel.link_snr(horizontal_m, link)
     if link.fading == "rayleigh":
         snr = snr * channel.rayleigh_power(draws.scatter)
     elif link.fading == "rician":
         factor = xp.where(draws.sight < los, channel.rician_factor(elevation, link), xp.zeros_like(snr))
         snr = snr * channel.fading_power(draws.scatter, factor)
     if link.fading == "ergodic":
-        rate = channel.ergodic_rate_bps(snr, link.bandwidth_hz)
-    else:
-        rate = channel.rate_bps(snr, link.bandwidth_hz)
-    bits = scenario.traffic.packet_bits
-    if isinstance(bits, tuple):
-        bits = xp.asarray(bits, dtype=snr.dtype, device=snr.device)[index]
-    return snr, rate, bits
+        return snr, channel.ergodic_rate_bps(snr, link.bandwidth_hz)
+    return snr, channel.rate_bps(snr, link.bandwidth_hz)
 
 
 def age_term(scenario: Scenario, age_s: Array, next_age_s: Array, duration_s: Array) -> Array:
-    """Age part of eq. (reward), (N,): ages (N, K) after the step, or integrated over it, weighted by delta_k."""
+    """Age part of eq. (reward), (...): ages (..., K) after the step, or integrated over it, weighted by delta_k."""
     xp = array_namespace(age_s)
     objective, traffic = scenario.objective, scenario.traffic
     cost = next_age_s
@@ -91,20 +112,20 @@ def advance(
     Returns:
         The state after the step and what happened in it.
     """
-    xp = array_namespace(state.position_m)
+    xp = array_namespace(state.time_s)
     frame, objective, limits, traffic = scenario.airframe, scenario.objective, scenario.limits, scenario.traffic
     zero = xp.zeros_like(state.time_s)
 
-    position = _fly(state.position_m, action.displacement_m, frame.max_displacement_m, scenario.area)
-    moved = position - state.position_m
-    move_s = length(moved) / frame.speed_mps
+    from_x, from_y = components(state.position_m)
+    x, y = _fly(from_x, from_y, action.displacement_m, frame.max_displacement_m, scenario.area)
+    moved_x, moved_y = x - from_x, y - from_y
+    move_s = length(moved_x, moved_y) / frame.speed_mps
 
     wants = action.device > 0
-    # one flat index into N x K is looked up several times as fast as a pair of indices
     index = xp.maximum(action.device - 1, 0)
-    rows = xp.arange(index.shape[0], device=index.device)
-    device_m = xp.take(layout_m.reshape((-1, 2)), rows * layout_m.shape[1] + index, axis=0)
-    snr, rate, bits = _transmit(scenario, device_m, position, index, draws)
+    device_x, device_y = components(_place(layout_m, index))
+    snr, rate = _transmit(scenario, length(device_x - x, device_y - y), draws)
+    bits = _packet_bits(scenario, index, snr)
     transmission_s = channel.transmission_s(bits, rate)
     limit_s = scenario.channel.max_transmission_s
     never = xp.zeros_like(wants)
@@ -113,7 +134,7 @@ def advance(
         outage = wants & (transmission_s > limit_s)
         transmission_s = xp.minimum(transmission_s, limit_s)
     transmission_s = xp.where(wants, transmission_s, zero)
-    arrived = wants & ~outage
+    arrived = wants & xp.logical_not(outage)
 
     idle_s = zero + frame.decision_s if decision_s is None or frame.decision_time == "fixed" else decision_s
     if frame.min_idle_s > 0:
@@ -125,15 +146,15 @@ def advance(
     idle_j = energy.idle_energy_j(idle_s, frame)
     total_j = move_j + communication_j + idle_j  # eq. (energy_total)
 
-    devices = xp.arange(layout_m.shape[1], dtype=index.dtype, device=index.device)
-    reset = xp.where(arrived, index, -1)[:, None] == devices
+    devices = array_namespace(layout_m).arange(layout_m.shape[-2], device=layout_m.device)
+    reset = per_device(xp.where(arrived, index, -1)) == devices
     ages = age.next_age_s(state.age_s, reset, duration_s, traffic.max_age_s)
     age_cost = age_term(scenario, state.age_s, ages, duration_s)
     energy_term = total_j / hover_reference_j(scenario, energy.hover_power_w(frame))
     reward = -(objective.age_weight * age_cost + (1.0 - objective.age_weight) * energy_term)  # eq. (reward)
 
     after = SimState(
-        position_m=position,
+        position_m=xp.stack((x, y), axis=-1),
         age_s=ages,
         energy_j=total_j,
         used_j=state.used_j + total_j,
@@ -150,7 +171,7 @@ def advance(
         reward=reward,
         age_term=age_cost,
         energy_term=energy_term,
-        displacement_m=moved,
+        displacement_m=xp.stack((moved_x, moved_y), axis=-1),
         duration_s=duration_s,
         move_s=move_s,
         transmission_s=transmission_s,
@@ -165,6 +186,6 @@ def advance(
         served=arrived,
         outage=outage,
         terminated=terminated,
-        truncated=truncated & ~terminated,
+        truncated=truncated & xp.logical_not(terminated),
     )
     return after, outcome

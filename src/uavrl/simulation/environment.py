@@ -69,16 +69,31 @@ def check_action(action: Mapping[str, Any], lead: tuple[int, ...], scenario: Sce
     """
     displacement_m, device = _numbers(action["displacement_m"], "displacement_m"), np.asarray(action["device"])
     count = scenario.traffic.devices
-    for what, array, shape in (("displacement_m", displacement_m, (*lead, 2)), ("device", device, lead)):
-        if array.shape != shape:
-            raise ScenarioError(f"{what} has shape {array.shape}, allowed: {shape}")
+    if displacement_m.shape != (*lead, 2):
+        raise ScenarioError(f"displacement_m has shape {displacement_m.shape}, allowed: {(*lead, 2)}")
+    if device.shape != lead:
+        raise ScenarioError(f"device has shape {device.shape}, allowed: {lead}")
     if not np.isfinite(displacement_m).all():
         raise ScenarioError(f"displacement_m = {_worst(displacement_m, ~np.isfinite(displacement_m))}, allowed: metres")
     if device.dtype.kind not in "iu":
         raise ScenarioError(f"device is of type {device.dtype}, allowed: integers, 0 (idle) to {count}")
-    if device.min() < 0 or device.max() > count:
+    low, high = (device.min(), device.max()) if lead else (device, device)
+    if low < 0 or high > count:
         raise ScenarioError(f"device = {_worst(device, (device < 0) | (device > count))}, allowed: 0 (idle) to {count}")
     return FlightAction(displacement_m, device.astype(np.int64, copy=False))
+
+
+def check_reset(options: dict[str, Any] | None) -> dict[str, Any]:
+    """The options of a reset.
+
+    Raises:
+        ScenarioError: one that does not exist.
+    """
+    options = options or {}
+    unknown = set(options) - {"position_m", "layout"}
+    if unknown:
+        raise ScenarioError(f"reset option {sorted(unknown)[0]!r} does not exist, allowed: 'position_m', 'layout'")
+    return options
 
 
 def _worst(array: NDArray[Any], bad: NDArray[np.bool_]) -> str:
@@ -91,13 +106,13 @@ def random_positions(generator: np.random.Generator, shape: tuple[int, ...], sce
     return positions
 
 
-def draw(generator: np.random.Generator, count: int) -> Draws:
-    """One step's randomness for `count` environments."""
-    return Draws(scatter=generator.standard_normal((count, 2)), sight=generator.random(count))
+def draw(generator: np.random.Generator, *count: int) -> Draws:
+    """One step's randomness for `count` environments; without a count, of one, the same numbers as for a count of 1."""
+    return Draws(scatter=generator.standard_normal((*count, 2)), sight=generator.random(count or None))
 
 
 def observe(kind: ObservationKind, scenario: Scenario, layout_m: Float, state: SimState) -> Observation:
-    """The batched float32 observation of `kind`: (N, K+3), or {"uav": (N, 4), "devices": (N, K, 6)}."""
+    """The float32 observation of `kind`: (..., K+3), or {"uav": (..., 4), "devices": (..., K, 6)}."""
     if kind == "paper":
         return paper_observation(state.position_m, state.age_s, state.energy_j).astype(np.float32)
     seen = devices_observation(scenario, layout_m, state.position_m, state.age_s, state.energy_j, state.used_j)
@@ -138,8 +153,8 @@ def action_space(scenario: Scenario) -> spaces.Dict:
 
 
 def outcome_info(state: SimState, outcome: Outcome, layout_m: Float) -> dict[str, Any]:
-    """The `info` of a step, batched: every field of the outcome, ages, positions and clocks."""
-    info = vars(outcome) | {"age_s": state.age_s, "position_m": state.position_m, "layout_m": layout_m}
+    """The `info` of a step: every field of the outcome, ages, positions and clocks."""
+    info = outcome._asdict() | {"age_s": state.age_s, "position_m": state.position_m, "layout_m": layout_m}
     return info | {"time_s": state.time_s, "step": state.step, "step_s": outcome.duration_s}
 
 
@@ -193,10 +208,7 @@ class DataCollectionVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     def _restart(self, mask: NDArray[np.bool_], options: dict[str, Any] | None) -> None:
         """Reset the environments of `mask`; draws for all of them, so that streams do not depend on the mask."""
-        options = options or {}
-        unknown = set(options) - {"position_m", "layout"}
-        if unknown:
-            raise ScenarioError(f"reset option {sorted(unknown)[0]!r} does not exist, allowed: 'position_m', 'layout'")
+        options = check_reset(options)
         count, devices = self.num_envs, self.scenario.traffic.devices
         layout = random_positions(self.np_random, (count, devices, 2), self.scenario)
         position = random_positions(self.np_random, (count, 2), self.scenario)
@@ -239,7 +251,7 @@ class DataCollectionVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self.state = state
         if before.any():
             self._restart(before, None)
-            outcome = _rows(before, Outcome(**{k: np.zeros_like(v) for k, v in vars(outcome).items()}), outcome)
+            outcome = _rows(before, Outcome(*map(np.zeros_like, outcome)), outcome)
         self._done = outcome.terminated | outcome.truncated
         info = outcome_info(self.state, outcome, self.layout_m)
         return self.observation(), outcome.reward, outcome.terminated, outcome.truncated, info
@@ -249,7 +261,7 @@ def _rows(mask: NDArray[np.bool_], chosen: _Rows, other: _Rows) -> _Rows:
     """The rows of `chosen` where `mask` (N,), else those of `other`."""
     merged = {
         name: np.where(mask[:, None] if value.ndim == 2 else mask, getattr(chosen, name), value)
-        for name, value in vars(other).items()
+        for name, value in other._asdict().items()
     }
     return type(other)(**merged)
 
@@ -273,42 +285,50 @@ class DataCollectionEnv(gymnasium.Env[Any, Any]):
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise ScenarioError(f"render_mode = {render_mode!r}, allowed: none, 'rgb_array'")
-        self._one = DataCollectionVectorEnv(1, scenario, layout, observation, **overrides)
-        self.scenario = self._one.scenario
+        self.scenario = load_scenario(scenario, **overrides)
         self.render_mode = render_mode
-        self.observation_space = self._one.single_observation_space
-        self.action_space = self._one.single_action_space
-        self._path_m: list[Float] = []
-        self._served = 0
+        self.kind = observation
+        self._fixed_layout = None if layout is None else check_layout(layout, self.scenario)
+        self.observation_space = observation_space(observation, self.scenario)
+        self.action_space = action_space(self.scenario)
+        self.layout_m = np.zeros((self.scenario.traffic.devices, 2))
+        self._start(np.zeros(2))
 
-    @property
-    def state(self) -> SimState:
-        """The simulator's state, N = 1."""
-        return self._one.state
-
-    @property
-    def layout_m(self) -> Float:
-        """Device positions (1, K, 2) (m)."""
-        return self._one.layout_m
+    def _start(self, position_m: Float) -> None:
+        ages = np.zeros(self.scenario.traffic.devices)
+        self.state = SimState(position_m, ages, energy_j=0.0, used_j=0.0, time_s=0.0, step=0)
+        self._path_m, self._served = [position_m], 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode. `options`: position_m (2,), layout (K, 2)."""
         super().reset(seed=seed)
-        self._one.np_random = self.np_random  # one generator, so that equal seeds mean equal draws
-        observation, info = self._one.reset(options=options)
-        self._path_m, self._served = [self.state.position_m[0]], 0
-        return _first(observation), _first(info)
+        wanted = check_reset(options)
+        # both are drawn whatever is given, so that streams do not depend on it
+        layout = random_positions(self.np_random, (self.scenario.traffic.devices, 2), self.scenario)
+        position = random_positions(self.np_random, (2,), self.scenario)
+        if wanted.get("layout") is not None:
+            layout = check_layout(wanted["layout"], self.scenario)
+        elif self._fixed_layout is not None:
+            layout = self._fixed_layout
+        if wanted.get("position_m") is not None:
+            position = _check_positions(wanted["position_m"], (2,), "position_m", self.scenario)
+        self.layout_m = layout.copy()
+        self._start(position.copy())
+        info = {"age_s": self.state.age_s, "position_m": self.state.position_m, "layout_m": self.layout_m}
+        return observe(self.kind, self.scenario, self.layout_m, self.state), _copied(info)
 
     def step(self, action: dict[str, Any]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Fly and serve once."""
         wanted = check_action(action, (), self.scenario)
-        self._one._done[:] = False  # only a reset starts a new episode here
-        observation, reward, terminated, truncated, info = self._one._advance(
-            FlightAction(wanted.displacement_m[None], wanted.device[None])
+        served = int(wanted.device)
+        self.state, outcome = advance(
+            self.scenario, self.layout_m, self.state, wanted._replace(device=served), draw(self.np_random)
         )
-        self._path_m.append(self.state.position_m[0])
-        self._served = int(wanted.device)
-        return _first(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), _first(info)
+        self._path_m.append(self.state.position_m)
+        self._served = served
+        info = _copied(outcome_info(self.state, outcome, self.layout_m))
+        observation = observe(self.kind, self.scenario, self.layout_m, self.state)
+        return observation, float(outcome.reward), outcome.terminated, outcome.truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """The map with devices coloured by age, the trajectory and the served link, (H, W, 3)."""
@@ -317,13 +337,11 @@ class DataCollectionEnv(gymnasium.Env[Any, Any]):
         from uavrl.simulation.rendering import draw_frame  # here: matplotlib is slow to import
 
         frame: NDArray[np.uint8] = draw_frame(
-            self.scenario, self.layout_m[0], np.array(self._path_m), self.state.age_s[0], self._served
+            self.scenario, self.layout_m, np.array(self._path_m), self.state.age_s, self._served
         )
         return frame
 
 
-def _first(batch: Any) -> Any:
-    """Row 0 of a batched observation or info; numbers become Python's own."""
-    if isinstance(batch, dict):
-        return {key: value.item() if value.ndim == 1 else value[0].copy() for key, value in batch.items()}
-    return batch[0].copy()
+def _copied(info: dict[str, Any]) -> dict[str, Any]:
+    """Arrays of one's own, and Python's numbers: what is handed out may be written to."""
+    return {key: value.copy() if isinstance(value, np.ndarray) else value for key, value in info.items()}

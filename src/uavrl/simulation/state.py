@@ -1,8 +1,10 @@
-"""What the simulator carries from step to step. N environments, K devices; NumPy or torch arrays of one dtype."""
+"""What the simulator carries from step to step. N environments, K devices.
+
+NumPy or torch arrays of one dtype; of one environment alone the axis N is left out, and numbers are Python's own.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from uavrl.physics.arrays import Array
@@ -15,8 +17,7 @@ class FlightAction(NamedTuple):
     device: Array  # (N,) int64, 0 = idle, k = device k
 
 
-@dataclass(frozen=True)
-class SimState:
+class SimState(NamedTuple):
     """State between two steps."""
 
     position_m: Array  # (N, 2)
@@ -27,16 +28,14 @@ class SimState:
     step: Array  # (N,) int64
 
 
-@dataclass(frozen=True)
-class Draws:
+class Draws(NamedTuple):
     """The randomness of one step: the same shape whatever the fading."""
 
     scatter: Array  # (N, 2) standard normal, the small-scale fading
     sight: Array  # (N,) uniform in [0, 1), line of sight or not
 
 
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(NamedTuple):
     """What a step did."""
 
     reward: Array  # (N,) -(lambda age_term + (1 - lambda) energy_term)

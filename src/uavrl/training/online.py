@@ -111,7 +111,7 @@ class OnlineLearner:
         )
         fresh = self.ended  # the environment reset these instead of stepping them
         live = ~fresh & (self.episode < self.config.episodes)
-        outcome = Outcome(**{name: info[name] for name in Outcome.__dataclass_fields__})
+        outcome = Outcome(**{name: info[name] for name in Outcome._fields})
         columns = transition_columns(
             self.environment.layout_m, before, action, self.environment.state, outcome, self.episode, before.step
         )
@@ -212,7 +212,7 @@ class OnlineLearner:
             "environment": numpy_state(self.environment.np_random),
         }
         state = {
-            f"state.{name}": torch.from_numpy(value.copy()) for name, value in vars(self.environment.state).items()
+            f"state.{name}": torch.from_numpy(value.copy()) for name, value in self.environment.state._asdict().items()
         }
         loop = {
             "layout_m": torch.from_numpy(self.environment.layout_m.copy()),
@@ -248,7 +248,7 @@ class OnlineLearner:
         loop = {name: tensor.numpy() for name, tensor in tensors["loop"].items()}
         learner.log.load_state_dict({name: tensor.numpy() for name, tensor in tensors["log"].items()})
         learner.environment.restore(
-            SimState(**{name: loop[f"state.{name}"] for name in SimState.__dataclass_fields__}),
+            SimState(**{name: loop[f"state.{name}"] for name in SimState._fields}),
             loop["layout_m"],
             loop["ended"],
         )
