@@ -314,8 +314,7 @@ class DataCollectionEnv(gymnasium.Env[Any, Any]):
             position = _check_positions(wanted["position_m"], (2,), "position_m", self.scenario)
         self.layout_m = layout.copy()
         self._start(position.copy())
-        info = {"age_s": self.state.age_s, "position_m": self.state.position_m, "layout_m": self.layout_m}
-        return observe(self.kind, self.scenario, self.layout_m, self.state), _copied(info)
+        return self._observation(), self._kept({})
 
     def step(self, action: dict[str, Any]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Fly and serve once."""
@@ -326,9 +325,17 @@ class DataCollectionEnv(gymnasium.Env[Any, Any]):
         )
         self._path_m.append(self.state.position_m)
         self._served = served
-        info = _copied(outcome_info(self.state, outcome, self.layout_m))
-        observation = observe(self.kind, self.scenario, self.layout_m, self.state)
-        return observation, float(outcome.reward), outcome.terminated, outcome.truncated, info
+        info = self._kept(outcome_info(self.state, outcome, self.layout_m))
+        return self._observation(), float(outcome.reward), outcome.terminated, outcome.truncated, info
+
+    def _observation(self) -> Observation:
+        return observe(self.kind, self.scenario, self.layout_m, self.state)
+
+    def _kept(self, info: dict[str, Any]) -> dict[str, Any]:
+        """`info` with copies of what the next step reads: what is handed out may be written to."""
+        info["age_s"], info["position_m"] = self.state.age_s.copy(), self.state.position_m.copy()
+        info["layout_m"] = self.layout_m.copy()
+        return info
 
     def render(self) -> NDArray[np.uint8] | None:
         """The map with devices coloured by age, the trajectory and the served link, (H, W, 3)."""
@@ -340,8 +347,3 @@ class DataCollectionEnv(gymnasium.Env[Any, Any]):
             self.scenario, self.layout_m, np.array(self._path_m), self.state.age_s, self._served
         )
         return frame
-
-
-def _copied(info: dict[str, Any]) -> dict[str, Any]:
-    """Arrays of one's own, and Python's numbers: what is handed out may be written to."""
-    return {key: value.copy() if isinstance(value, np.ndarray) else value for key, value in info.items()}
