@@ -55,6 +55,8 @@ class Train:
     """a setting as name=value, such as bc_weight=0.3 or diffusion.steps=10; repeat it for more"""
     device: Literal["cpu", "cuda"] = "cpu"
     """where to compute"""
+    compile: Literal["none", "step", "graphs"] = "none"
+    """compile the networks' passes, half a minute once: pays from some 5,000 updates; graphs: in CUDA graphs, too"""
     evaluate_every: int = 0
     """updates between trial flights on 20 layouts of their own; 0: none"""
     resume: bool = False
@@ -87,6 +89,7 @@ class Train:
             seed=self.seed,
             log_every=min(LOG_EVERY, max(1, updates // 50)),  # enough rows to judge a short run by
             evaluate_every=self.evaluate_every,
+            compilation=self.compile,
         )
         output_directory(self.out)
         learner = OfflineLearner.resume(self.out, transitions, self.device) if self.resume else None

@@ -26,6 +26,7 @@ from uavrl.networks import fit_normalisers
 from uavrl.scenario import Scenario
 from uavrl.training.batches import OBSERVATION_OF, reward_transform, spaces_of, to_batch, transformed
 from uavrl.training.checkpoint import agent_tensors, load_checkpoint, recover, restore_agent, save_checkpoint
+from uavrl.training.compilation import Compilation, compile_passes
 from uavrl.training.fit import learn_once, take
 from uavrl.training.health import Expected
 from uavrl.training.interrupts import held_interrupts
@@ -54,6 +55,7 @@ class TrainConfig(BaseModel):
     log_every: int = Field(200, ge=1, description="updates between rows of metrics.jsonl")
     save_every: int = Field(5_000, ge=1, description="updates between checkpoints")
     evaluate_every: int = Field(0, ge=0, description="updates between trial flights; 0: none")
+    compilation: Compilation = Field("none", description="of the networks' passes, see `compile_passes`")
 
 
 def _to(data: Batch, device: torch.device) -> Batch:
@@ -100,6 +102,7 @@ class OfflineLearner:
             self.agent = make_agent(spaces_of(config.scenario, config.agent.network.kind), agent)
         fit_normalisers(self.agent.networks, data.observation)
         self.agent.networks.to(self.device)
+        compile_passes(self.agent, config.compilation, self.device)
         self.data = _to(data, self.device)
         self.generator = torch.Generator(self.device).manual_seed(config.seed)
         self.digest = transitions.digest()
@@ -144,6 +147,8 @@ class OfflineLearner:
             for group in optimiser.param_groups:
                 group["lr"] = rate
         self.agent.progress = self.updates / self.config.updates
+        if self.config.compilation == "graphs":
+            torch.compiler.cudagraph_mark_step_begin()
         metrics = learn_once(self.agent, self.data, self.generator)
         self.updates += 1
         return metrics
