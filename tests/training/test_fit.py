@@ -5,7 +5,7 @@ import torch
 
 from tests.agents.problems import agent, batch, copies, equal
 from uavrl.agents.base import Batch, Metrics
-from uavrl.training.fit import fit, learn_once, take
+from uavrl.training.fit import fit, learn_once
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -27,7 +27,7 @@ def test_fit_sets_the_normalisers_and_updates_so_many_times_on_minibatches() -> 
     noise = generator()
     for _ in range(3):
         rows = torch.randint(0, 40, (8,), generator=noise)
-        last = straight.update(take(data, rows), noise)
+        last = straight.update(data.take(rows), noise)
     assert equal(copies(straight.networks), copies(fitted.networks))
     assert metrics == {name: float(value) for name, value in last.items()}
     assert fit(fitted, data, 0, generator()) == {}

@@ -19,7 +19,7 @@ from uavrl.agents.diffusion_sac import DiffusionSacConfig
 from uavrl.datasets import Transitions
 from uavrl.errors import CheckpointError, ConfigError, DivergenceError
 from uavrl.training.checkpoint import agent_tensors, load_checkpoint
-from uavrl.training.offline import OfflineLearner, TrainConfig, take
+from uavrl.training.offline import OfflineLearner, TrainConfig
 from uavrl.training.policy import AgentPolicy, load_policy
 
 SCENARIO = small_scenario()
@@ -146,10 +146,10 @@ def test_an_agent_knows_how_much_of_its_training_is_done_also_after_a_stop(tmp_p
 
 def test_what_an_update_sees_is_a_row_of_the_data_as_a_whole(flown: Transitions) -> None:
     learner = OfflineLearner(config(agent={"reward": {"transform": "centred", "clip": 1.5, "scale": 2.0}}), flown)
-    data, index = learner.data, torch.tensor([5, 0, 5])
+    data, index = learner.sample, torch.tensor([5, 0, 5])
     reward = np.clip(2.0 * (flown.reward - np.median(flown.reward)), -1.5, 1.5)
     np.testing.assert_allclose(data.reward.numpy(), reward, rtol=1e-4, atol=1e-5)
-    found = take(data, index)
+    found = learner.data.take(index)
     assert isinstance(found.observation, dict)
     assert isinstance(data.observation, dict)
     assert isinstance(found.next_observation, dict)
@@ -329,7 +329,7 @@ def test_what_a_run_is_judged_by_follows_from_settings_and_data(
     assert expected.q[0] < expected.q[1]
     assert (expected.bc_loss is None) == (loss is None)
     assert loss is None or expected.bc_loss == pytest.approx(loss)
-    assert expected.reward_deviation == pytest.approx(float(learner.data.reward.numpy().std()))
+    assert expected.reward_deviation == pytest.approx(float(learner.sample.reward.numpy().std()))
 
 
 def test_discounting_per_second_is_judged_by_the_shortest_step(flown: Transitions) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal
@@ -30,6 +30,32 @@ class Batch:
     duration_s: Tensor  # (B,)
     terminated: Tensor  # (B,) float, 1 where no future follows; a truncation is 0 and bootstraps
     next_observation: Observation  # (B, ...)
+
+    def __len__(self) -> int:
+        return len(self.reward)
+
+    def take(self, rows: Tensor) -> Batch:
+        """Rows by their numbers (M,), as often as they are named."""
+        return self._each(lambda values: values.index_select(0, rows))
+
+    def to(self, device: torch.device) -> Batch:
+        """Itself where it is there already, else a copy."""
+        return self._each(lambda values: values.to(device))
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> Batch:
+        def seen(observation: Observation) -> Observation:
+            if isinstance(observation, dict):
+                return {key: change(values) for key, values in observation.items()}
+            return change(observation)
+
+        return Batch(
+            observation=seen(self.observation),
+            action=HybridAction(change(self.action.continuous), change(self.action.choice)),
+            reward=change(self.reward),
+            duration_s=change(self.duration_s),
+            terminated=change(self.terminated),
+            next_observation=seen(self.next_observation),
+        )
 
 
 class RewardConfig(BaseModel):

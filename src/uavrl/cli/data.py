@@ -10,15 +10,17 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
+from uavrl.datasets.columns import MappedTransitions, save_columns
 from uavrl.datasets.flat import SUFFIXES, save_flat
 from uavrl.datasets.minari_io import write_minari
 from uavrl.datasets.report import describe, render
 from uavrl.datasets.selection import Quality, select
-from uavrl.datasets.sources import load_source
+from uavrl.datasets.sources import load_parts, load_source
+from uavrl.datasets.transitions import Transitions
 from uavrl.errors import DatasetError
 from uavrl.simulation.observations import ObservationKind
 
-Source = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME|FILE|MINARI_ID")]
+Source = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME|PATH|MINARI_ID")]
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,7 @@ class DataShow:
     """Report what logged flights hold: behaviour, coverage, choices."""
 
     source: Source
-    """fixed or layouts, a .parquet or .npz file, or the id of a Minari dataset"""
+    """fixed or layouts, a .parquet or .npz file, a .columns directory, or the id of a Minari dataset"""
     scenario: str | None = None
     """preset or .toml file that it was flown in; none: the one it carries"""
     json: Path | None = None
@@ -34,6 +36,8 @@ class DataShow:
 
     def run(self) -> None:
         transitions, scenario = load_source(self.source, self.scenario)
+        if isinstance(transitions, MappedTransitions):
+            transitions.verify(self.source)
         summary = describe(transitions, scenario)
         Console().print(render(summary, self.source))
         if self.json is not None:
@@ -49,9 +53,9 @@ class DataSelect:
     """Write a seeded part of a training's log to a flat file."""
 
     source: Source
-    """fixed or layouts, a .parquet or .npz file, or the id of a Minari dataset"""
+    """fixed or layouts, a .parquet or .npz file, a .columns directory, or the id of a Minari dataset"""
     out: Path
-    """.parquet or .npz file to write"""
+    """.parquet or .npz file, or .columns directory, to write"""
     size: int = 30_000
     """transitions"""
     quality: Quality = "mixed"
@@ -73,18 +77,23 @@ class DataConvert:
     """Write logged flights in another form."""
 
     source: Source
-    """fixed or layouts, a .parquet or .npz file, or the id of a Minari dataset"""
-    target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="FILE|MINARI_ID")]
-    """.parquet or .npz file, or the id of a new Minari dataset (whole episodes only)"""
+    """fixed or layouts, a .parquet or .npz file, a .columns directory, or the id of a Minari dataset"""
+    target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PATH|MINARI_ID")]
+    """.parquet or .npz file, .columns directory, or the id of a new Minari dataset (whole episodes only)"""
     scenario: str | None = None
     """preset or .toml file that it was flown in; none: the one it carries"""
     observation: ObservationKind = "devices"
     """observations of a Minari dataset"""
 
     def run(self) -> None:
-        transitions, scenario = load_source(self.source, self.scenario)
-        if Path(self.target).suffix in SUFFIXES:
-            save_flat(self.target, transitions, scenario)
+        transitions: Transitions
+        if Path(self.target).suffix == ".columns":  # part by part: the log need not fit into memory
+            parts, scenario = load_parts(self.source, self.scenario)
+            transitions = save_columns(self.target, parts, scenario, self.source)
         else:
-            write_minari(self.target, transitions, scenario, self.observation)
+            transitions, scenario = load_source(self.source, self.scenario)
+            if Path(self.target).suffix in SUFFIXES:
+                save_flat(self.target, transitions, scenario)
+            else:
+                write_minari(self.target, transitions, scenario, self.observation)
         Console().print(f"{self.target}: {transitions!r}", highlight=False, soft_wrap=True)

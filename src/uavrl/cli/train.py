@@ -36,9 +36,9 @@ class Train:
     out: Path
     """directory of the run: checkpoint, metrics.jsonl and, where asked for, tensorboard"""
     data: str = "layouts"
-    """layouts or fixed (built in), or a .parquet or .npz file, or the id of a Minari dataset"""
+    """layouts or fixed (built in), a .parquet or .npz file, a .columns directory, or the id of a Minari dataset"""
     size: int | None = None
-    """transitions to learn from; by default 30,000 of a built-in data set, all of a file"""
+    """transitions to draw and learn from, in memory; by default 30,000 of a built-in data set, all of any other"""
     quality: Literal["mixed", "good", "bad"] = "mixed"
     """part of the log that --size draws from: all, the last third, the first third"""
     data_seed: int = 0
@@ -135,9 +135,9 @@ def trial_flights(transitions: Transitions, scenario: Scenario, episodes: int = 
     from uavrl.training.policy import AgentPolicy
 
     environments = evaluation_set(scenario, "random", episodes, seed=TRIAL_SEED)
-    layouts = np.unique(transitions.layout_m, axis=0)
-    if len(layouts) == 1:
-        environments = replace(environments, layout_m=np.repeat(layouts.astype(np.float64), episodes, axis=0))
+    layout = transitions.layout_m[:1].astype(np.float64)
+    if all((part.layout_m == layout).all() for part in transitions.parts()):
+        environments = replace(environments, layout_m=np.repeat(layout, episodes, axis=0))
 
     def evaluate(policy: AgentPolicy) -> dict[str, float]:
         flown = fly(policy, environments, deterministic=policy.agent.acts_best_deterministically)

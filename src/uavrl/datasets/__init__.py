@@ -1,16 +1,18 @@
-"""Logged flights: in memory, as flat files, as Minari datasets; selection, validation and a report on them."""
+"""Logged flights: in memory, mapped, as flat files, as Minari datasets; selection, validation and a report on them."""
 
+from uavrl.datasets.columns import MappedTransitions, save_columns
 from uavrl.datasets.flat import load_flat, save_flat, stored_scenario
 from uavrl.datasets.minari_io import read_minari, write_minari
 from uavrl.datasets.replay import ReplayLog
 from uavrl.datasets.report import describe
 from uavrl.datasets.selection import Quality, select
-from uavrl.datasets.sources import builtin_names, load_builtin, load_source
+from uavrl.datasets.sources import builtin_names, load_builtin, load_parts, load_source
 from uavrl.datasets.transitions import COLUMNS, Transitions, concatenate, transition_columns
 from uavrl.datasets.validation import validate
 
 __all__ = [
     "COLUMNS",
+    "MappedTransitions",
     "Quality",
     "ReplayLog",
     "Transitions",
@@ -19,8 +21,10 @@ __all__ = [
     "describe",
     "load_builtin",
     "load_flat",
+    "load_parts",
     "load_source",
     "read_minari",
+    "save_columns",
     "save_flat",
     "select",
     "stored_scenario",

@@ -1,4 +1,4 @@
-"""Flat files: Parquet or npz with the columns of `COLUMNS`, one row a transition."""
+"""Flat files: Parquet, npz or a directory of columns, those of `COLUMNS`, one row a transition."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ import pyarrow.parquet as pq
 from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
-from uavrl.datasets.transitions import COLUMNS, Transitions
+from uavrl.datasets.columns import load_columns, save_columns, scenario_text
+from uavrl.datasets.transitions import COLUMNS, PART_ROWS, Transitions
 from uavrl.datasets.validation import validate
 from uavrl.errors import DatasetError
 from uavrl.scenario import Scenario, parse_scenario
 
-SUFFIXES = (".parquet", ".npz")
+SUFFIXES = (".parquet", ".npz", ".columns")
 OPTIONAL = ("used_j", "next_used_j")  # both or neither; left out, they are 0
 
 _SCENARIO = "uavrl_scenario"  # TOML: metadata of a Parquet file, an array of npz
@@ -33,13 +34,16 @@ _STORED: dict[str, type[np.generic]] = {"int": np.int32, "float": np.float32, "b
 
 
 def save_flat(path: str | Path, transitions: Transitions, scenario: Scenario) -> None:
-    """Write Parquet or npz, as the suffix says, with the scenario inside; a whole file or none, never half of one.
+    """Write what the suffix says, with the scenario inside; all of it or nothing, never half.
 
     Raises:
         DatasetError: another suffix, transitions that `validate` refuses, or a path that cannot be written.
     """
     path = Path(path)
     _check_suffix(path)
+    if path.suffix == ".columns":
+        save_columns(path, transitions.parts(), scenario)
+        return
     validate(transitions, scenario, str(path))
     arrays: dict[str, NDArray[Any]] = {
         name: np.ascontiguousarray(values.reshape(len(values), -1) if values.ndim > 1 else values).astype(
@@ -98,34 +102,56 @@ def load_flat(path: str | Path, scenario: Scenario) -> Transitions:
     """Read and validate Parquet or npz, of ours or of a user; numbers may be of any type and width.
 
     `layout_m` holds x and y of each device in turn, 2K a row; (n, K, 2) is read as well. Other columns are ignored.
+    A directory of columns is mapped, see `load_columns`.
 
     Raises:
         DatasetError: a file that cannot be read, a missing column, or what `validate` refuses: file, row and column.
     """
     path = Path(path)
+    if path.suffix == ".columns":
+        return load_columns(path, scenario)
     columns, _ = _read(path)
-    missing = [name for name in COLUMNS if name not in columns]
-    if missing == list(OPTIONAL) and scenario.limits.energy_budget_j is None:
-        columns |= {name: np.zeros(len(columns["reward"])) for name in OPTIONAL}
-    elif missing:
-        name = missing[0]
-        raise DatasetError(f"{path}: column '{name}' is missing: {COLUMNS[name].meaning}")
-    count, devices = len(columns["reward"]), scenario.traffic.devices
-    fitted = {name: _fit(path, name, columns[name], count, devices) for name in COLUMNS}
-    transitions = Transitions(**fitted)
+    transitions = _transitions(path, columns, scenario)
     validate(transitions, scenario, str(path))
     return transitions
 
 
+def read_parts(path: str | Path, scenario: Scenario) -> Iterator[Transitions]:
+    """The rows of Parquet in turn, at most `PART_ROWS` in memory; not validated: that is left to who takes them.
+
+    Raises:
+        DatasetError: a file that cannot be read, a missing column, a wrong shape or type.
+    """
+    path = Path(path)
+    with _named_errors(path), pq.ParquetFile(path, page_checksum_verification=True, buffer_size=2**20) as file:
+        names, first = [name for name in COLUMNS if name in file.schema_arrow.names], 0
+        for batch in file.iter_batches(PART_ROWS, columns=names):
+            columns = {name: _unnest(path, name, batch[name], 1, first) for name in names}
+            yield _transitions(path, columns, scenario, first)
+            first += len(batch)
+
+
+def _transitions(path: Path, columns: dict[str, NDArray[Any]], scenario: Scenario, first: int = 0) -> Transitions:
+    """Columns as they are in a file, in their types in memory; `first` is the number of the first row."""
+    missing = [name for name in COLUMNS if name not in columns]
+    if missing == list(OPTIONAL) and scenario.limits.energy_budget_j is None:
+        columns = columns | {name: np.zeros(len(columns["reward"])) for name in OPTIONAL}
+    elif missing:
+        name = missing[0]
+        raise DatasetError(f"{path}: column '{name}' is missing: {COLUMNS[name].meaning}")
+    count, devices = len(columns["reward"]), scenario.traffic.devices
+    return Transitions(**{name: _fit(path, name, columns[name], count, devices, first) for name in COLUMNS})
+
+
 def stored_scenario(path: str | Path) -> Scenario | None:
-    """The scenario that a flat file carries; None where a user's file carries none.
+    """The scenario that flat data carry; None where a user's file carries none.
 
     Raises:
         DatasetError: a file that cannot be read.
         ScenarioError: a scenario that is not valid.
     """
     path = Path(path)
-    _, text = _read(path, only_scenario=True)
+    text = scenario_text(path) if path.suffix == ".columns" else _read(path, only_scenario=True)[1]
     if text is None:
         return None
     try:
@@ -143,7 +169,7 @@ def _read(path: Path, *, only_scenario: bool = False) -> tuple[dict[str, NDArray
     """The known columns of a file as they are, and its scenario's TOML."""
     _check_suffix(path)
     wanted = () if only_scenario else tuple(COLUMNS)
-    try:
+    with _named_errors(path):
         if path.suffix == ".npz":
             with path.open("rb") as opened, NpzFile(opened, allow_pickle=False) as archive:
                 text = str(archive[_SCENARIO]) if _SCENARIO in archive else None
@@ -154,6 +180,13 @@ def _read(path: Path, *, only_scenario: bool = False) -> tuple[dict[str, NDArray
             names = [name for name in wanted if name in file.schema_arrow.names]
             table = file.read(columns=names)
         return {name: _unnest(path, name, table[name].combine_chunks(), 1) for name in names}, text
+
+
+@contextmanager
+def _named_errors(path: Path) -> Iterator[None]:
+    """What goes wrong inside while `path` is read, as one line that names it."""
+    try:
+        yield
     except FileNotFoundError:
         raise DatasetError(f"{path}: no such file") from None
     except _UNREADABLE as error:
@@ -165,23 +198,23 @@ def _refuse(path: Path, row: int, name: str, shown: str, allowed: str) -> NoRetu
     raise DatasetError(f"{path}: row {row}, column '{name}' = {shown}, allowed: {allowed}")
 
 
-def _unnest(path: Path, name: str, array: Any, per_row: int) -> NDArray[Any]:
+def _unnest(path: Path, name: str, array: Any, per_row: int, first: int = 0) -> NDArray[Any]:
     """An Arrow column of numbers or of equally long lists of them as (n,) or (n, length, ...) array."""
     if array.null_count:
         row = int(np.argmax(array.is_null().to_numpy(zero_copy_only=False))) // per_row
-        _refuse(path, row, name, "nothing", COLUMNS[name].meaning)
+        _refuse(path, first + row, name, "nothing", COLUMNS[name].meaning)
     if not any(is_list(array.type) for is_list in _LISTS):
         return np.asarray(array.to_numpy(zero_copy_only=False))
     lengths = pc.list_value_length(array).to_numpy(zero_copy_only=False)
     length = int(lengths[0]) if len(lengths) else 0
     if (lengths != length).any():
         row = int(np.argmax(lengths != length))
-        _refuse(path, row // per_row, name, f"{lengths[row]} values", f"{length}, as in row 0")
-    inner = _unnest(path, name, array.flatten(), per_row * max(length, 1))
+        _refuse(path, first + row // per_row, name, f"{lengths[row]} values", f"{length}, as in row {first}")
+    inner = _unnest(path, name, array.flatten(), per_row * max(length, 1), first)
     return inner.reshape(len(array), length, *inner.shape[1:])
 
 
-def _fit(path: Path, name: str, values: NDArray[Any], count: int, devices: int) -> NDArray[Any]:
+def _fit(path: Path, name: str, values: NDArray[Any], count: int, devices: int, first: int) -> NDArray[Any]:
     """A column as its shape and type in memory demand."""
     column = COLUMNS[name]
     shape = column.row_shape(devices)
@@ -201,6 +234,6 @@ def _fit(path: Path, name: str, values: NDArray[Any], count: int, devices: int) 
         if odd.any():
             row = int(np.argmax(odd))
             whole = "whole numbers" if column.kind == "int" else "true or false, 1 or 0"
-            _refuse(path, row, name, f"{values[row]:g}", f"{whole}: {column.meaning}")
+            _refuse(path, first + row, name, f"{values[row]:g}", f"{whole}: {column.meaning}")
     with np.errstate(over="ignore"):  # becomes infinite, which validate names
         return values.astype(column.dtype, copy=False).reshape(count, *shape)

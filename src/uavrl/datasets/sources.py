@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 
-from uavrl.datasets.flat import SUFFIXES, load_flat, stored_scenario
+from uavrl.datasets.flat import SUFFIXES, load_flat, read_parts, stored_scenario
 from uavrl.datasets.minari_io import read_minari
 from uavrl.datasets.selection import Quality, select
 from uavrl.datasets.transitions import Transitions
@@ -41,17 +42,22 @@ def _read_builtin(name: str, scenario: Scenario | None) -> tuple[Transitions, Sc
 
 
 def _read_file(path: Path, scenario: Scenario | None) -> tuple[Transitions, Scenario]:
+    scenario = _flown_in(path, scenario)
+    return load_flat(path, scenario), scenario
+
+
+def _flown_in(path: Path, scenario: Scenario | None) -> Scenario:
     scenario = stored_scenario(path) if scenario is None else scenario
     if scenario is None:
         raise DatasetError(f"{path}: carries no scenario, name the one it was flown in (--scenario)")
-    return load_flat(path, scenario), scenario
+    return scenario
 
 
 def load_source(source: str | Path, scenario: str | Scenario | None = None) -> tuple[Transitions, Scenario]:
     """All transitions of a source, and the scenario they were flown in.
 
     Args:
-        source: a name of `builtin_names`, a .parquet or .npz file, or the id of a Minari dataset.
+        source: a name of `builtin_names`, a .parquet or .npz file, a .columns directory, or the id of a Minari dataset.
         scenario: preset, TOML file or Scenario to read them under; None: the one that the source carries.
 
     Raises:
@@ -68,3 +74,12 @@ def load_source(source: str | Path, scenario: str | Scenario | None = None) -> t
     if named is not None:
         validate(transitions, named, str(source))
     return transitions, stored if named is None else named
+
+
+def load_parts(source: str | Path, scenario: str | Scenario | None = None) -> tuple[Iterator[Transitions], Scenario]:
+    """As `load_source`, part by part: of a Parquet file a part at a time is in memory, and none is validated yet."""
+    if Path(source).suffix == ".parquet":
+        flown_in = _flown_in(Path(source), None if scenario is None else load_scenario(scenario))
+        return read_parts(source, flown_in), flown_in
+    transitions, flown_in = load_source(source, scenario)
+    return transitions.parts(), flown_in

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -19,6 +19,8 @@ from uavrl.simulation.state import FlightAction, Outcome, SimState
 Float = NDArray[np.float32]
 Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
+
+PART_ROWS = 65_536  # of a log that is gone through piece by piece
 
 
 class Column(NamedTuple):
@@ -119,7 +121,7 @@ class Transitions:
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Every column by name; the arrays themselves, not copies."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: getattr(self, name) for name in COLUMNS}
 
     def observations(self, kind: ObservationKind, scenario: Scenario) -> tuple[Observation, Observation]:
         """What a policy saw before and after each step, float32, as `uavrl.simulation.environment.observe` gives it."""
@@ -134,6 +136,11 @@ class Transitions:
     def take(self, indices: NDArray[Any] | slice) -> Transitions:
         """The rows of an integer or boolean index, or of a slice."""
         return Transitions(**{name: values[indices] for name, values in self.columns().items()})
+
+    def parts(self, rows: int = PART_ROWS) -> Iterator[Transitions]:
+        """All rows in turn, at most `rows` at a time; views, not copies."""
+        for start in range(0, len(self), rows):
+            yield self.take(slice(start, start + rows))
 
     def in_order(self) -> Transitions:
         """The rows sorted by (episode, step), as files hold them."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ def _apart(values: NDArray[Any], others: NDArray[Any], absolute: float) -> NDArr
     return apart
 
 
-def validate(transitions: Transitions, scenario: Scenario, source: str = "transitions") -> None:
+def validate(transitions: Transitions, scenario: Scenario, source: str = "transitions", *, first_row: int = 0) -> None:
     """Check transitions under a scenario.
 
     Numbers are finite and in their ranges; the reward is eq. (reward) of the scenario; moves lead from position to next
@@ -36,28 +37,64 @@ def validate(transitions: Transitions, scenario: Scenario, source: str = "transi
         transitions: n rows.
         scenario: what they were flown in.
         source: how the message names the data.
+        first_row: what the message counts the first row as.
 
     Raises:
-        DatasetError: one line with row (from 0), column, value and what is allowed.
+        DatasetError: one line with row (from `first_row`), column, value and what is allowed.
     """
-    if transitions.devices != scenario.traffic.devices:
-        raise DatasetError(
-            f"{source}: K = {transitions.devices} devices, allowed: {scenario.traffic.devices}, "
-            f"as scenario '{scenario.name}' has"
-        )
+    _devices(transitions, scenario, source)
     if not len(transitions):
         raise DatasetError(f"{source}: no rows, allowed: 1 or more")
-    check = _Check(transitions, source)
+    check = _Check(transitions, source, first_row)
     _ranges(check, transitions, scenario)
     _order(check, transitions)
     _reward(check, transitions, scenario)
     _continuity(check, transitions)
 
 
+def validated(parts: Iterable[Transitions], scenario: Scenario, source: str = "transitions") -> Iterator[Transitions]:
+    """The parts of one log as they come, each after `validate` has seen it together with the row before it.
+
+    Memory is a few parts'. Each part goes on where the one before it ended; empty ones are left out.
+
+    Raises:
+        DatasetError: as of `validate`, with rows counted from the log's first.
+    """
+    rows, last = 0, None
+    for part in parts:
+        if not len(part):
+            continue
+        _devices(part, scenario, source)
+        if last is None:
+            validate(part, scenario, source)
+        else:
+            validate(_joined(last, part), scenario, source, first_row=rows - 1)
+        yield part
+        rows, last = rows + len(part), part.take(np.array([-1]))
+    if last is None:
+        raise DatasetError(f"{source}: no rows, allowed: 1 or more")
+
+
+def _joined(first: Transitions, then: Transitions) -> Transitions:
+    """Rows as they stand, unlike `concatenate`, which numbers the episodes on."""
+    return Transitions(
+        **{name: np.concatenate([values, then.columns()[name]]) for name, values in first.columns().items()}
+    )
+
+
+def _devices(transitions: Transitions, scenario: Scenario, source: str) -> None:
+    if transitions.devices != scenario.traffic.devices:
+        raise DatasetError(
+            f"{source}: K = {transitions.devices} devices, allowed: {scenario.traffic.devices}, "
+            f"as scenario '{scenario.name}' has"
+        )
+
+
 class _Check:
-    def __init__(self, transitions: Transitions, source: str) -> None:
+    def __init__(self, transitions: Transitions, source: str, first_row: int) -> None:
         self.transitions = transitions
         self.source = source
+        self.first_row = first_row
 
     def refuse(self, name: str, bad: NDArray[np.bool_], allowed: str, other: NDArray[Any] | None = None) -> None:
         """Raise if any entry of `bad` is true, naming the first; `other` holds the values that {other} stands for."""
@@ -67,9 +104,9 @@ class _Check:
         row, entry = index[0], "".join(f"[{i}]" for i in index[1:])
         value = getattr(self.transitions, name)[index]
         shown = ", ".join(f"{number:.7g}" for number in np.ravel(value))
-        episode, step = self.transitions.episode[row], self.transitions.step[row]
+        where = f"episode {self.transitions.episode[row]}, step {self.transitions.step[row]}"
         raise DatasetError(
-            f"{self.source}: row {row} (episode {episode}, step {step}), column '{name}'{entry} = {shown}, allowed: "
+            f"{self.source}: row {self.first_row + row} ({where}), column '{name}'{entry} = {shown}, allowed: "
             + (allowed if other is None else allowed.format(other=f"{other[index]:.7g}"))
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,29 @@ def to_batch(transitions: Transitions, kind: ObservationKind, scenario: Scenario
         terminated=torch.from_numpy(transitions.terminated.astype(np.float32)),
         next_observation=to_tensors(after),
     )
+
+
+class MappedRows:
+    """Transitions that stay where they are: a minibatch's rows are read and encoded when it is drawn.
+
+    Whatever `take` answers is equal, bit for bit, to what it would take from all rows encoded at once.
+
+    Args:
+        transitions: n rows.
+        encode: from rows in memory to the batch an agent sees, each row by itself.
+    """
+
+    def __init__(self, transitions: Transitions, encode: Callable[[Transitions], Batch]) -> None:
+        self.transitions = transitions
+        self.encode = encode
+
+    def __len__(self) -> int:
+        return len(self.transitions)
+
+    def take(self, rows: torch.Tensor) -> Batch:
+        """As of `uavrl.training.fit.Rows`; read in the order of the files, each row once."""
+        ascending, places = torch.unique(rows.cpu(), return_inverse=True)
+        return self.encode(self.transitions.take(ascending.numpy())).take(places).to(rows.device)
 
 
 def reward_transform(reward: NDArray[Any], config: RewardConfig, terminates: bool) -> tuple[float, float]:

@@ -8,37 +8,29 @@ The loop of `uavrl.training.offline` has checkpoints, a log and trial flights be
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import torch
 
-from uavrl.actions import HybridAction
 from uavrl.agents.base import Agent, Batch, Metrics
-from uavrl.networks import Observation, fit_normalisers
+from uavrl.networks import fit_normalisers
 
 
-def take_observation(observation: Observation, rows: torch.Tensor) -> Observation:
-    """Rows of an observation."""
-    if isinstance(observation, dict):
-        return {key: value.index_select(0, rows) for key, value in observation.items()}
-    return observation.index_select(0, rows)
+class Rows(Protocol):
+    """What minibatches are drawn from: a `Batch` in memory, or `uavrl.training.batches.MappedRows`."""
+
+    def __len__(self) -> int: ...
+
+    def take(self, rows: torch.Tensor) -> Batch:
+        """Rows by their numbers (B,), in this order and as often as they are named, on the device of `rows`."""
+        ...
 
 
-def take(data: Batch, rows: torch.Tensor) -> Batch:
-    """Rows of a batch."""
-    return Batch(
-        observation=take_observation(data.observation, rows),
-        action=HybridAction(data.action.continuous.index_select(0, rows), data.action.choice.index_select(0, rows)),
-        reward=data.reward.index_select(0, rows),
-        duration_s=data.duration_s.index_select(0, rows),
-        terminated=data.terminated.index_select(0, rows),
-        next_observation=take_observation(data.next_observation, rows),
-    )
-
-
-def learn_once(agent: Agent, data: Batch, generator: torch.Generator) -> Metrics:
+def learn_once(agent: Agent, data: Rows, generator: torch.Generator) -> Metrics:
     """One update on a fresh minibatch, drawn with replacement."""
     shape = (agent.config.batch_size,)
-    rows = torch.randint(0, len(data.reward), shape, generator=generator, device=generator.device)
-    return agent.update(take(data, rows), generator)
+    rows = torch.randint(0, len(data), shape, generator=generator, device=generator.device)
+    return agent.update(data.take(rows), generator)
 
 
 def fit(agent: Agent, data: Batch, updates: int, generator: torch.Generator) -> dict[str, float]:

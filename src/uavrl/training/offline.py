@@ -6,40 +6,42 @@ import json
 import math
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import fields
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from uavrl.actions import HybridAction
 from uavrl.agents.base import Batch
 from uavrl.agents.bc import BcConfig
 from uavrl.agents.diffusion_sac import DiffusionSacConfig
 from uavrl.agents.gaussian_bc import GaussianBcConfig
 from uavrl.agents.registry import OfflineConfig, make_agent
+from uavrl.datasets.columns import MappedTransitions
 from uavrl.datasets.transitions import Transitions
 from uavrl.errors import CheckpointError, ConfigError, DivergenceError
 from uavrl.evaluation.rollouts import EVALUATION_SEED
 from uavrl.networks import fit_normalisers
 from uavrl.scenario import Scenario
-from uavrl.training.batches import OBSERVATION_OF, reward_transform, spaces_of, to_batch, transformed
+from uavrl.training.batches import OBSERVATION_OF, MappedRows, reward_transform, spaces_of, to_batch, transformed
 from uavrl.training.checkpoint import agent_tensors, load_checkpoint, recover, restore_agent, save_checkpoint
 from uavrl.training.compilation import Compilation, compile_passes
-from uavrl.training.fit import learn_once, take
+from uavrl.training.fit import Rows, learn_once
 from uavrl.training.health import Expected
 from uavrl.training.interrupts import held_interrupts
 from uavrl.training.log import MetricsLog, Reporter
 from uavrl.training.policy import AgentPolicy
 from uavrl.training.support import Support
 
-__all__ = ["PRESET_UPDATES", "Evaluator", "OfflineLearner", "TrainConfig", "take"]
+__all__ = ["PRESET_UPDATES", "Evaluator", "OfflineLearner", "TrainConfig"]
 
 Evaluator = Callable[[AgentPolicy], dict[str, float]]
 
 # The paper: J = 150 passes over 30 k rows in batches of 64
 PRESET_UPDATES = {"default": 12_000, "paper": 70_000}
+
+SAMPLE_ROWS = 100_000  # of mapped data, for statistics: a mean is off by 0.3 % of the deviation
 
 
 class TrainConfig(BaseModel):
@@ -58,19 +60,13 @@ class TrainConfig(BaseModel):
     compilation: Compilation = Field("none", description="of the networks' passes, see `compile_passes`")
 
 
-def _to(data: Batch, device: torch.device) -> Batch:
-    def move(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: entry.to(device) for key, entry in value.items()}
-        if isinstance(value, HybridAction):
-            return HybridAction(value.continuous.to(device), value.choice.to(device))
-        return value.to(device)
-
-    return Batch(**{field.name: move(getattr(data, field.name)) for field in fields(Batch)})
-
-
 class OfflineLearner:
-    """An agent, its data as tensors, and the generator of data order and noise.
+    """An agent, its data, and the generator of data order and noise.
+
+    Data in memory become tensors at once. Of mapped data each minibatch is read when it is drawn, and statistics (the
+    reward's median, mean and deviation, the normalisers', the rows that `Support` knows) are of `SAMPLE_ROWS` rows, the
+    same every time, or of all where there are fewer; least and largest reward and the shortest step are of all rows. So
+    memory does not grow with mapped data, and up to `SAMPLE_ROWS` rows they train as in memory, bit for bit.
 
     Logging draws from generators of its own, so how often it happens changes nothing of what is learned.
 
@@ -86,24 +82,33 @@ class OfflineLearner:
             raise ConfigError("device = 'cuda', but torch finds no GPU; allowed here: 'cpu'")
         self.config, self.device = config, torch.device(device)
         kind = OBSERVATION_OF[config.agent.network.kind]
-        data = to_batch(transitions, kind, config.scenario)
+        known = transitions.sample(SAMPLE_ROWS) if isinstance(transitions, MappedTransitions) else transitions
         terminates = config.scenario.limits.energy_budget_j is not None
         reward = config.agent.reward
-        self.shift, factor = reward_transform(transitions.reward, reward, terminates)
-        data = Batch(
-            **{field.name: getattr(data, field.name) for field in fields(Batch) if field.name != "reward"},
-            reward=transformed(data.reward, self.shift, factor, reward),
-        )
+        self.shift, factor = reward_transform(known.reward, reward, terminates)
+
+        def seen(raw: torch.Tensor) -> torch.Tensor:
+            return transformed(raw, self.shift, factor, reward)
+
+        def encode(rows: Transitions) -> Batch:
+            batch = to_batch(rows, kind, config.scenario)
+            return replace(batch, reward=seen(batch.reward))
+
+        sample = encode(known)
         agent = config.agent
         if terminates and isinstance(agent, DiffusionSacConfig):
             agent = agent.model_copy(update={"pinned_level": False})  # as the shift: an end is compared with the level
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             self.agent = make_agent(spaces_of(config.scenario, config.agent.network.kind), agent)
-        fit_normalisers(self.agent.networks, data.observation)
+        fit_normalisers(self.agent.networks, sample.observation)
         self.agent.networks.to(self.device)
         compile_passes(self.agent, config.compilation, self.device)
-        self.data = _to(data, self.device)
+        self.sample = sample.to(self.device)  # what statistics are of
+        self.data: Rows = self.sample if known is transitions else MappedRows(transitions, encode)
+        extremes = seen(torch.tensor([transitions.reward.min(), transitions.reward.max()]))
+        self.rewards = (float(extremes[0]), float(extremes[1]))  # the least and the most that the agent is given
+        self.shortest_s = float(transitions.duration_s.min())
         self.generator = torch.Generator(self.device).manual_seed(config.seed)
         self.digest = transitions.digest()
         self.updates = 0
@@ -116,11 +121,11 @@ class OfflineLearner:
     def _discount(self) -> float:
         """The largest of any transition."""
         agent = self.config.agent
-        return agent.discount if agent.discount_per == "step" else agent.discount ** float(self.data.duration_s.min())
+        return agent.discount if agent.discount_per == "step" else agent.discount**self.shortest_s
 
     def _expected(self) -> Expected:
         """What the settings and the data allow of the log's numbers."""
-        agent, reward, spaces = self.config.agent, self.data.reward, self.agent.spaces
+        agent, spaces = self.config.agent, self.agent.spaces
         cloning = None
         if isinstance(agent, BcConfig) or (isinstance(agent, DiffusionSacConfig) and agent.bc_weight > 0):
             cloning = 1.0  # the squared error of a denoiser that answers 0 to unit noise
@@ -128,8 +133,8 @@ class OfflineLearner:
             cloning = spaces.continuous * math.log(2.0) + math.log(spaces.choices)  # a uniform guess
         horizon = 1.0 / (1.0 - self._discount())
         return Expected(
-            q=(min(float(reward.min()), 0.0) * horizon, max(float(reward.max()), 0.0) * horizon),
-            reward_deviation=float(reward.std(correction=0)),
+            q=(min(self.rewards[0], 0.0) * horizon, max(self.rewards[1], 0.0) * horizon),
+            reward_deviation=float(self.sample.reward.std(correction=0)),
             bc_loss=cloning,
             gradient_clip=agent.gradient_clip,
         )
@@ -156,7 +161,7 @@ class OfflineLearner:
     def support_distance(self) -> float:
         """How far the policy acts from the logged actions, see `Support`; the same rows and noise each time."""
         if self.support is None:
-            self.support = Support(self.data, seed=self.config.seed)
+            self.support = Support(self.sample, seed=self.config.seed)
         generator = torch.Generator(self.device).manual_seed(self.config.seed)
         return float(self.support.distance(self.agent, generator))
 
@@ -228,7 +233,7 @@ class OfflineLearner:
             "spaces": self.agent.spaces.model_dump(),
             "scenario": self.config.scenario.model_dump(mode="json"),
             "train": json.loads(self.config.model_dump_json()),
-            "data": {"rows": len(self.data.reward), "sha256": self.digest},
+            "data": {"rows": len(self.data), "sha256": self.digest},
             "step": self.updates,
             "device": self.device.type,
         }

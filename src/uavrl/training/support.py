@@ -7,7 +7,6 @@ from torch import Tensor
 
 from uavrl.agents.base import Agent, Batch
 from uavrl.networks import Observation
-from uavrl.training.fit import take_observation
 
 
 class Support:
@@ -30,7 +29,7 @@ class Support:
         logged = data.action.continuous
         generator = torch.Generator().manual_seed(seed)
         drawn = torch.randperm(len(logged), generator=generator)[:pool].to(logged.device)
-        flat = _flat(take_observation(data.observation, drawn))
+        flat = _flat(data.take(drawn).observation)
         deviation, mean = torch.std_mean(flat, dim=0, correction=0)
         flat = (flat - mean) / torch.where(deviation > 1e-6, deviation, torch.ones_like(deviation))
         count = min(rows, len(drawn))
@@ -38,7 +37,7 @@ class Support:
         own = torch.arange(count, device=logged.device)
         apart[own, own] = -1.0  # first, whatever else was logged at the same observation
         nearest = apart.topk(min(neighbours, len(drawn)), largest=False).indices
-        self.observation = take_observation(data.observation, drawn[:count])
+        self.observation = data.take(drawn[:count]).observation
         self.logged = logged[drawn[nearest]]  # (P, k, C)
 
     def distance(self, agent: Agent, generator: torch.Generator) -> Tensor:
