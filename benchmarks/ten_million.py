@@ -2,7 +2,7 @@
 
     python -m benchmarks.ten_million FOLDER --json results/speed/ten-million.json
 
-FOLDER gets `copies.columns`, 250 bytes a row, deleted at the end: the built-in `layouts`, over and over, each copy's
+FOLDER gets `copies.mapped`, 256 bytes a row, deleted at the end: the built-in `layouts`, over and over, each copy's
 episodes numbered on from the last. Everything runs in a process of its own, because memory is measured by process:
 
     peak_anonymous_mb   most of RssAnon in /proc/self/status, looked at every 5 ms: what is allocated. It is the
@@ -34,7 +34,7 @@ import torch
 
 from uavrl.agents.registry import preset
 from uavrl.benchmarks.timing import machine
-from uavrl.datasets import Transitions, load_source, save_columns, select
+from uavrl.datasets import Transitions, load_source, save_mapped, select
 from uavrl.training.batches import MappedRows, to_batch
 from uavrl.training.fit import Rows
 from uavrl.training.offline import OfflineLearner, TrainConfig
@@ -80,7 +80,7 @@ def with_memory(call: Callable[..., dict[str, Any]], *arguments: Any) -> dict[st
 def write(path: Path, rows: int) -> dict[str, Any]:
     """Stream the copies to disk."""
     log, scenario = load_source(SOURCE)
-    written = save_columns(path, copies(log, rows), scenario)
+    written = save_mapped(path, copies(log, rows), scenario)
     return {"rows": len(written), "size_mb": sum(file.stat().st_size for file in path.iterdir()) / 1e6}
 
 
@@ -166,7 +166,7 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=120)
     parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
-    path = asked.folder / "copies.columns"
+    path = asked.folder / "copies.mapped"
     try:
         found = {"written": alone(write, path, asked.rows)}
         evict(path)

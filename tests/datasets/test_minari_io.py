@@ -100,7 +100,7 @@ def test_a_dataset_is_not_written_over(log: Transitions, scenario: Scenario) -> 
 
 def test_what_cannot_be_read_is_refused(log: Transitions, scenario: Scenario, folder: Path) -> None:
     with pytest.raises(
-        DatasetError, match=r"'none-v0' is no built-in data, no \.parquet, \.npz or \.columns, and no Minari"
+        DatasetError, match=r"'none-v0' is no built-in data, no \.parquet, \.npz or \.mapped, and no Minari"
     ):
         read_minari("none-v0")
     with pytest.raises(DatasetError, match="'a b' is no built-in data"):

@@ -48,7 +48,7 @@ def test_a_source_without_a_scenario_needs_one(log: Transitions, scenario: Scena
 
 def test_unknown_sources_are_refused(tmp_path: Path) -> None:
     with pytest.raises(
-        DatasetError, match=r"'layout' is no built-in data, no \.parquet, \.npz or \.columns, and no Minari"
+        DatasetError, match=r"'layout' is no built-in data, no \.parquet, \.npz or \.mapped, and no Minari"
     ):
         load_source("layout")
     with pytest.raises(DatasetError, match="no such file"):

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from tests.datasets.flights import fly, small_scenario
 from uavrl.datasets import Transitions, select, validate
+from uavrl.datasets.validation import validated
 from uavrl.errors import DatasetError
 from uavrl.scenario import Scenario, load_scenario
 
@@ -112,6 +113,34 @@ def test_the_first_bad_row_is_named(log: Transitions, scenario: Scenario, change
         validate(Transitions(**columns), scenario, "my.parquet")
     assert str(caught.value).startswith("my.parquet: row ")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("rows", [1, 7])
+@pytest.mark.parametrize("change", REFUSED)
+def test_the_same_row_is_named_where_a_log_comes_in_parts(
+    log: Transitions, scenario: Scenario, change: str, rows: int
+) -> None:
+    """Also where it contradicts a row of the part before: with a row a part, every contradiction does."""
+    alter, _ = REFUSED[change]
+    columns = {name: values.copy() for name, values in log.columns().items()}
+    alter(columns)
+    whole = Transitions(**columns)
+    with pytest.raises(DatasetError) as expected:
+        validate(whole, scenario)
+    with pytest.raises(DatasetError) as caught:
+        list(validated(whole.parts(rows), scenario))
+    assert str(caught.value).split(",")[0] == str(expected.value).split(",")[0]  # row and episode
+
+
+def test_parts_pass_as_they_are_and_empty_ones_are_left_out(log: Transitions, scenario: Scenario) -> None:
+    nothing = log.take(slice(0, 0))
+    found = list(validated([nothing, *log.parts(50), nothing, log.take(slice(100, 100))], scenario))
+    assert [len(part) for part in found] == [50, 50, 20]
+    assert found[1].digest() == log.take(slice(50, 100)).digest()
+    with pytest.raises(DatasetError, match="log: no rows, allowed: 1 or more"):
+        list(validated([nothing], scenario, "log"))
+    with pytest.raises(DatasetError, match="K = 2 devices, allowed: 3"):
+        list(validated([log, fly(small_scenario(devices=2), steps=3)], scenario))
 
 
 def test_a_gap_excuses_a_jump_and_rounding_is_no_error(log: Transitions, scenario: Scenario) -> None:

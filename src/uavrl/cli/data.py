@@ -10,8 +10,8 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from uavrl.datasets.columns import MappedTransitions, save_columns
 from uavrl.datasets.flat import SUFFIXES, save_flat
+from uavrl.datasets.mapped import MappedTransitions, save_mapped
 from uavrl.datasets.minari_io import write_minari
 from uavrl.datasets.report import describe, render
 from uavrl.datasets.selection import Quality, select
@@ -28,7 +28,7 @@ class DataShow:
     """Report what logged flights hold: behaviour, coverage, choices."""
 
     source: Source
-    """fixed or layouts, a .parquet or .npz file, a .columns directory, or the id of a Minari dataset"""
+    """fixed or layouts, a .parquet or .npz file, a .mapped directory, or the id of a Minari dataset"""
     scenario: str | None = None
     """preset or .toml file that it was flown in; none: the one it carries"""
     json: Path | None = None
@@ -53,9 +53,9 @@ class DataSelect:
     """Write a seeded part of a training's log to a flat file."""
 
     source: Source
-    """fixed or layouts, a .parquet or .npz file, a .columns directory, or the id of a Minari dataset"""
+    """fixed or layouts, a .parquet or .npz file, a .mapped directory, or the id of a Minari dataset"""
     out: Path
-    """.parquet or .npz file, or .columns directory, to write"""
+    """.parquet or .npz file, or .mapped directory, to write"""
     size: int = 30_000
     """transitions"""
     quality: Quality = "mixed"
@@ -77,9 +77,9 @@ class DataConvert:
     """Write logged flights in another form."""
 
     source: Source
-    """fixed or layouts, a .parquet or .npz file, a .columns directory, or the id of a Minari dataset"""
+    """fixed or layouts, a .parquet or .npz file, a .mapped directory, or the id of a Minari dataset"""
     target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PATH|MINARI_ID")]
-    """.parquet or .npz file, .columns directory, or the id of a new Minari dataset (whole episodes only)"""
+    """.parquet or .npz file, .mapped directory, or the id of a new Minari dataset (whole episodes only)"""
     scenario: str | None = None
     """preset or .toml file that it was flown in; none: the one it carries"""
     observation: ObservationKind = "devices"
@@ -87,9 +87,9 @@ class DataConvert:
 
     def run(self) -> None:
         transitions: Transitions
-        if Path(self.target).suffix == ".columns":  # part by part: the log need not fit into memory
+        if Path(self.target).suffix == ".mapped":  # part by part: the log need not fit into memory
             parts, scenario = load_parts(self.source, self.scenario)
-            transitions = save_columns(self.target, parts, scenario, self.source)
+            transitions = save_mapped(self.target, parts, scenario, self.source)
         else:
             transitions, scenario = load_source(self.source, self.scenario)
             if Path(self.target).suffix in SUFFIXES:

@@ -36,7 +36,7 @@ class Train:
     out: Path
     """directory of the run: checkpoint, metrics.jsonl and, where asked for, tensorboard"""
     data: str = "layouts"
-    """layouts or fixed (built in), a .parquet or .npz file, a .columns directory, or the id of a Minari dataset"""
+    """layouts or fixed (built in), a .parquet or .npz file, a .mapped directory, or the id of a Minari dataset"""
     size: int | None = None
     """transitions to draw and learn from, in memory; by default 30,000 of a built-in data set, all of any other"""
     quality: Literal["mixed", "good", "bad"] = "mixed"

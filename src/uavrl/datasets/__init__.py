@@ -1,7 +1,7 @@
 """Logged flights: in memory, mapped, as flat files, as Minari datasets; selection, validation and a report on them."""
 
-from uavrl.datasets.columns import MappedTransitions, save_columns
 from uavrl.datasets.flat import load_flat, save_flat, stored_scenario
+from uavrl.datasets.mapped import MappedTransitions, save_mapped
 from uavrl.datasets.minari_io import read_minari, write_minari
 from uavrl.datasets.replay import ReplayLog
 from uavrl.datasets.report import describe
@@ -24,8 +24,8 @@ __all__ = [
     "load_parts",
     "load_source",
     "read_minari",
-    "save_columns",
     "save_flat",
+    "save_mapped",
     "select",
     "stored_scenario",
     "transition_columns",

@@ -18,13 +18,13 @@ import pyarrow.parquet as pq
 from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
-from uavrl.datasets.columns import load_columns, save_columns, scenario_text
+from uavrl.datasets.mapped import load_mapped, save_mapped, scenario_text
 from uavrl.datasets.transitions import COLUMNS, PART_ROWS, Transitions
 from uavrl.datasets.validation import validate
 from uavrl.errors import DatasetError
 from uavrl.scenario import Scenario, parse_scenario
 
-SUFFIXES = (".parquet", ".npz", ".columns")
+SUFFIXES = (".parquet", ".npz", ".mapped")
 OPTIONAL = ("used_j", "next_used_j")  # both or neither; left out, they are 0
 
 _SCENARIO = "uavrl_scenario"  # TOML: metadata of a Parquet file, an array of npz
@@ -41,8 +41,8 @@ def save_flat(path: str | Path, transitions: Transitions, scenario: Scenario) ->
     """
     path = Path(path)
     _check_suffix(path)
-    if path.suffix == ".columns":
-        save_columns(path, transitions.parts(), scenario)
+    if path.suffix == ".mapped":
+        save_mapped(path, transitions.parts(), scenario)
         return
     validate(transitions, scenario, str(path))
     arrays: dict[str, NDArray[Any]] = {
@@ -102,14 +102,14 @@ def load_flat(path: str | Path, scenario: Scenario) -> Transitions:
     """Read and validate Parquet or npz, of ours or of a user; numbers may be of any type and width.
 
     `layout_m` holds x and y of each device in turn, 2K a row; (n, K, 2) is read as well. Other columns are ignored.
-    A directory of columns is mapped, see `load_columns`.
+    A directory of columns is mapped, see `load_mapped`.
 
     Raises:
         DatasetError: a file that cannot be read, a missing column, or what `validate` refuses: file, row and column.
     """
     path = Path(path)
-    if path.suffix == ".columns":
-        return load_columns(path, scenario)
+    if path.suffix == ".mapped":
+        return load_mapped(path, scenario)
     columns, _ = _read(path)
     transitions = _transitions(path, columns, scenario)
     validate(transitions, scenario, str(path))
@@ -151,7 +151,7 @@ def stored_scenario(path: str | Path) -> Scenario | None:
         ScenarioError: a scenario that is not valid.
     """
     path = Path(path)
-    text = scenario_text(path) if path.suffix == ".columns" else _read(path, only_scenario=True)[1]
+    text = scenario_text(path) if path.suffix == ".mapped" else _read(path, only_scenario=True)[1]
     if text is None:
         return None
     try:

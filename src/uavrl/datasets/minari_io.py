@@ -159,7 +159,7 @@ def read_minari(dataset_id: str) -> tuple[Transitions, Scenario]:
         columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     except FileNotFoundError:
         raise DatasetError(
-            f"data '{dataset_id}' is no built-in data, no .parquet, .npz or .columns, and no Minari dataset here"
+            f"data '{dataset_id}' is no built-in data, no .parquet, .npz or .mapped, and no Minari dataset here"
         ) from None
     except (OSError, KeyError, ValueError, TypeError, IndexError) as error:
         reason = " ".join(str(error).split())

@@ -57,7 +57,7 @@ def load_source(source: str | Path, scenario: str | Scenario | None = None) -> t
     """All transitions of a source, and the scenario they were flown in.
 
     Args:
-        source: a name of `builtin_names`, a .parquet or .npz file, a .columns directory, or the id of a Minari dataset.
+        source: a name of `builtin_names`, a .parquet or .npz file, a .mapped directory, or the id of a Minari dataset.
         scenario: preset, TOML file or Scenario to read them under; None: the one that the source carries.
 
     Raises:

@@ -18,7 +18,7 @@ from uavrl.agents.bc import BcConfig
 from uavrl.agents.diffusion_sac import DiffusionSacConfig
 from uavrl.agents.gaussian_bc import GaussianBcConfig
 from uavrl.agents.registry import OfflineConfig, make_agent
-from uavrl.datasets.columns import MappedTransitions
+from uavrl.datasets.mapped import MappedTransitions
 from uavrl.datasets.transitions import Transitions
 from uavrl.errors import CheckpointError, ConfigError, DivergenceError
 from uavrl.evaluation.rollouts import EVALUATION_SEED

@@ -1,11 +1,14 @@
 """A directory of memory-mapped columns: logged flights that need not fit into memory.
 
-    flights.columns/
-        columns.json     rows, K, SHA-256 of all columns, the version that wrote them
+    flights.mapped/
+        rows.npy         an array of rows, each with all of `COLUMNS` in their types in memory
+        manifest.json    rows, K, SHA-256 of all columns, the version that wrote them
         scenario.toml    what they were flown in
-        reward.npy ...   one file a column of `COLUMNS`, of the type that it has in memory
 
-It is validated while it is written, under a temporary name, then renamed. Opening it reads the headers alone.
+A row lies in one piece: a random one costs one read of the disk or one miss of the caches, where a file a column would
+take twenty. A column of the mapped array is a view of it.
+
+All is validated while it is written, under a temporary name, then renamed. Opening it reads no row.
 """
 
 from __future__ import annotations
@@ -13,7 +16,6 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterable
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
@@ -23,12 +25,13 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from uavrl import __version__
-from uavrl.datasets.transitions import COLUMNS, Column, Transitions
+from uavrl.datasets.transitions import COLUMNS, Transitions
 from uavrl.datasets.validation import validated
 from uavrl.errors import DatasetError
 from uavrl.scenario import Scenario
 
-MANIFEST = "columns.json"
+MANIFEST = "manifest.json"
+_ROWS = "rows.npy"
 _SCENARIO = "scenario.toml"
 
 
@@ -70,13 +73,13 @@ class MappedTransitions(Transitions):
         return self.take(np.sort(drawn))
 
 
-def save_columns(
+def save_mapped(
     path: str | Path, parts: Iterable[Transitions], scenario: Scenario, source: str | None = None
 ) -> MappedTransitions:
     """Write a log that comes part by part, each validated, in memory of a few parts; whole or not at all.
 
     Args:
-        path: directory to make, suffix .columns.
+        path: directory to make, suffix .mapped.
         parts: rows sorted by (episode, step) throughout, as `validated` takes them.
         scenario: what they were flown in.
         source: how a message names the parts; None: by `path`.
@@ -88,18 +91,20 @@ def save_columns(
         DatasetError: another suffix, a path that exists or cannot be written, or what `validate` refuses.
     """
     path = Path(path)
-    if path.suffix != ".columns":
-        raise DatasetError(f"{path}: suffix '{path.suffix}', allowed: .columns")
+    if path.suffix != ".mapped":
+        raise DatasetError(f"{path}: suffix '{path.suffix}', allowed: .mapped")
     if path.exists():  # one directory cannot take another's place in one step
         raise DatasetError(f"{path}: exists, choose another name or remove it first")
     temporary = path.with_name(f".{path.name}.tmp")
     try:
         shutil.rmtree(temporary, ignore_errors=True)  # left by a writer that was killed
         temporary.mkdir(parents=True)
-        rows = _write(temporary, validated(parts, scenario, source or str(path)), scenario.traffic.devices)
+        devices = scenario.traffic.devices
+        count = _write(temporary / _ROWS, validated(parts, scenario, source or str(path)), devices)
         (temporary / _SCENARIO).write_text(scenario.to_toml(), encoding="utf-8")
-        written = Transitions(**{name: np.load(temporary / f"{name}.npy", mmap_mode="r") for name in COLUMNS})
-        manifest = _Manifest(rows=rows, devices=written.devices, sha256=written.digest())
+        rows = np.lib.format.open_memmap(temporary / _ROWS, mode="r")
+        digest = Transitions(**{name: rows[name] for name in COLUMNS}).digest()
+        manifest = _Manifest(rows=count, devices=devices, sha256=digest)
         (temporary / MANIFEST).write_text(manifest.model_dump_json(indent=1) + "\n", encoding="utf-8")
         for entry in (*temporary.iterdir(), temporary):
             _sync(entry)
@@ -109,29 +114,33 @@ def save_columns(
         raise DatasetError(f"{path}: cannot be written: {error.strerror or error}") from None
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-    return open_columns(path)
+    return open_mapped(path)
 
 
-def _write(directory: Path, parts: Iterable[Transitions], devices: int) -> int:
-    """Append each part to the columns' files; the number of rows."""
-    rows = 0
-    with ExitStack() as stack:
-        files = {name: stack.enter_context((directory / f"{name}.npy").open("wb")) for name in COLUMNS}
-        for name, column in COLUMNS.items():
-            _write_header(files[name], column, 0, devices)
+def _record(devices: int) -> np.dtype[Any]:
+    """A row, K = `devices`: 256 bytes for 10."""
+    fields = [(name, column.dtype, column.row_shape(devices)) for name, column in COLUMNS.items()]
+    return np.dtype(fields, align=True)
+
+
+def _write(path: Path, parts: Iterable[Transitions], devices: int) -> int:
+    """Append each part to the file of rows; their number."""
+    record, count = _record(devices), 0
+    with path.open("wb") as file:
+        _write_header(file, record, 0)
         for part in parts:
+            rows = np.zeros(len(part), record)  # zeros also between the columns
             for name, values in part.columns().items():
-                files[name].write(np.ascontiguousarray(values).data)
-            rows += len(part)
-        for name, column in COLUMNS.items():
-            files[name].seek(0)
-            _write_header(files[name], column, rows, devices)  # as long as before: NumPy leaves room for the rows
-    return rows
+                rows[name] = values
+            file.write(rows.view(np.uint8).data)
+            count += len(part)
+        file.seek(0)
+        _write_header(file, record, count)  # as long as before: NumPy leaves room for the number of rows
+    return count
 
 
-def _write_header(file: BinaryIO, column: Column, rows: int, devices: int) -> None:
-    shape = (rows, *column.row_shape(devices))
-    header = {"descr": np.lib.format.dtype_to_descr(column.dtype), "fortran_order": False, "shape": shape}
+def _write_header(file: BinaryIO, record: np.dtype[Any], count: int) -> None:
+    header = {"descr": np.lib.format.dtype_to_descr(record), "fortran_order": False, "shape": (count,)}
     np.lib.format.write_array_header_1_0(file, header)
 
 
@@ -143,23 +152,23 @@ def _sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def load_columns(path: str | Path, scenario: Scenario) -> MappedTransitions:
-    """As `open_columns`; all rows are validated, part by part, only under another scenario than they were written with.
+def load_mapped(path: str | Path, scenario: Scenario) -> MappedTransitions:
+    """As `open_mapped`; all rows are validated, part by part, only under another scenario than they were written with.
 
     Raises:
-        DatasetError: as of `open_columns` and `validate`.
+        DatasetError: as of `open_mapped` and `validate`.
     """
-    transitions = open_columns(path)
+    transitions = open_mapped(path)
     if scenario.to_toml() != scenario_text(path):
         for _ in validated(transitions.parts(), scenario, str(path)):
             pass
     return transitions
 
 
-def open_columns(path: str | Path) -> MappedTransitions:
-    """Map what `save_columns` wrote.
+def open_mapped(path: str | Path) -> MappedTransitions:
+    """Map what `save_mapped` wrote.
 
-    Names, types, shapes and lengths are checked, and no row is read: `MappedTransitions.verify` does that.
+    Columns, types and lengths are checked, and no row is read: `MappedTransitions.verify` does that.
 
     Raises:
         DatasetError: no such directory, or one that is not whole.
@@ -171,8 +180,8 @@ def open_columns(path: str | Path) -> MappedTransitions:
         reason = error.errors()[0]
         field = ".".join(str(place) for place in reason["loc"])
         raise DatasetError(f"{path / MANIFEST}: damaged or of another version: {field} {reason['msg']}") from None
-    columns = {name: _map(path, name, column, manifest) for name, column in COLUMNS.items()}
-    return MappedTransitions(**columns, sha256=manifest.sha256)
+    rows = _map(path / _ROWS, manifest)
+    return MappedTransitions(**{name: rows[name] for name in COLUMNS}, sha256=manifest.sha256)
 
 
 def scenario_text(path: str | Path) -> str:
@@ -190,24 +199,19 @@ def _read(path: Path, name: str) -> str:
     try:
         return (path / name).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise DatasetError(f"{path}: no whole directory of columns: {name} cannot be read: {error}") from None
+        raise DatasetError(f"{path}: no whole directory of mapped flights: {name} cannot be read: {error}") from None
 
 
-def _map(path: Path, name: str, column: Column, manifest: _Manifest) -> NDArray[Any]:
-    file = path / f"{name}.npy"
+def _map(file: Path, manifest: _Manifest) -> NDArray[Any]:
+    """The rows (n,); their columns are views."""
     try:
-        values = np.load(file, mmap_mode="r", allow_pickle=False)
-    except FileNotFoundError:
-        raise DatasetError(f"{path}: column '{name}' is missing: {column.meaning}") from None
+        rows = np.lib.format.open_memmap(file, mode="r")
     except (OSError, ValueError, EOFError) as error:
         reason = " ".join(str(error).split())
-        raise DatasetError(f"{path}: column '{name}' is cut short or damaged: {reason}") from None
-    shape = (manifest.rows, *column.row_shape(manifest.devices))
-    found = f"{values.dtype} {values.shape}" if isinstance(values, np.memmap) else "no array"
-    if found != f"{column.dtype} {shape}":
-        raise DatasetError(
-            f"{path}: column '{name}' holds {found}, allowed: {column.dtype} {shape}, as {MANIFEST} says"
-        )
-    if file.stat().st_size != values.offset + values.nbytes:
-        raise DatasetError(f"{path}: column '{name}' has more bytes than its {manifest.rows:,} rows")
-    return np.asarray(values)
+        raise DatasetError(f"{file}: missing, cut short or damaged: {reason}") from None
+    expected = _record(manifest.devices)
+    if (rows.dtype, rows.shape) != (expected, (manifest.rows,)):
+        raise DatasetError(f"{file}: holds other columns or rows than {MANIFEST} says")
+    if file.stat().st_size != rows.offset + rows.nbytes:
+        raise DatasetError(f"{file}: has more bytes than its {manifest.rows:,} rows")
+    return np.asarray(rows)
