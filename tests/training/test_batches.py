@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from tests.datasets.flights import fly, small_scenario
-from uavrl.agents.base import RewardConfig
+from uavrl.agents.base import Batch, RewardConfig
 from uavrl.scenario import load_scenario
 from uavrl.simulation.environment import observe
 from uavrl.simulation.observations import ObservationKind
 from uavrl.simulation.state import SimState
-from uavrl.training.batches import reward_transform, spaces_of, to_batch, transformed
+from uavrl.training.batches import MappedRows, reward_transform, spaces_of, to_batch, transformed
 
 
 @pytest.mark.parametrize("kind", ["paper", "devices"])
@@ -55,6 +55,24 @@ def test_a_truncated_flight_goes_on_in_the_batch_and_a_drained_battery_ends_it()
     log = fly(endless, steps=30)
     assert log.truncated.any()
     assert not to_batch(log, "paper", endless).terminated.any()
+
+
+@pytest.mark.parametrize("kind", ["paper", "devices"])
+def test_rows_read_one_by_one_are_those_taken_from_all_to_the_last_bit(kind: ObservationKind) -> None:
+    scenario = small_scenario(energy_budget_j=200.0)
+    log = fly(scenario, steps=20)
+    data, rows = to_batch(log, kind, scenario), torch.tensor([50, 3, 3, 0, 59, 50])
+    mapped = MappedRows(log, lambda part: to_batch(part, kind, scenario))
+    assert len(mapped) == len(data) == 60
+
+    def tensors(batch: Batch) -> list[torch.Tensor]:
+        seen = [batch.observation, batch.next_observation]
+        flat = [value for one in seen for value in (one.values() if isinstance(one, dict) else [one])]
+        return [*flat, *batch.action, batch.reward, batch.duration_s, batch.terminated]
+
+    for found, expected in zip(tensors(mapped.take(rows)), tensors(data.take(rows)), strict=True):
+        assert found.dtype == expected.dtype
+        assert torch.equal(found, expected)
 
 
 def test_spaces_are_those_of_the_scenario() -> None:

@@ -1,7 +1,10 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +19,7 @@ from uavrl.agents.base import Batch, Metrics
 from uavrl.agents.bc import BcConfig
 from uavrl.agents.diffusion_actor import DiffusionConfig
 from uavrl.agents.diffusion_sac import DiffusionSacConfig
-from uavrl.datasets import Transitions
+from uavrl.datasets import MappedTransitions, Transitions, save_mapped
 from uavrl.errors import CheckpointError, ConfigError, DivergenceError
 from uavrl.training.checkpoint import agent_tensors, load_checkpoint
 from uavrl.training.offline import OfflineLearner, TrainConfig
@@ -37,6 +40,12 @@ def config(name: str = "diffusion_sac", kind: str = "devices", **changes: Any) -
 @pytest.fixture(scope="module")
 def flown() -> Transitions:
     return fly(SCENARIO, steps=20)
+
+
+@pytest.fixture(scope="module")
+def mapped(flown: Transitions, tmp_path_factory: pytest.TempPathFactory) -> MappedTransitions:
+    """The same rows on disk."""
+    return save_mapped(tmp_path_factory.mktemp("data") / "flown.mapped", [flown], SCENARIO)
 
 
 def quiet(done: int, text: str) -> None:
@@ -349,3 +358,91 @@ def test_the_level_is_pinned_only_where_no_flight_can_end_by_itself(flown: Trans
     assert OfflineLearner(plan, flown).agent.config == plan.agent
     ends = plan.model_copy(update={"scenario": SCENARIO.replace(energy_budget_j=1e6)})
     assert not OfflineLearner(ends, flown).agent.config.pinned_level  # type: ignore[attr-defined]  # Diffusion-SAC's
+
+
+@pytest.mark.parametrize(("name", "kind"), [("diffusion_sac", "devices"), ("diffusion_sac", "mlp"), ("bc", "devices")])
+def test_mapped_data_train_as_the_same_data_in_memory_also_after_a_stop(
+    tmp_path: Path, flown: Transitions, mapped: MappedTransitions, name: str, kind: str
+) -> None:
+    straight = OfflineLearner(config(name, kind), flown)
+    straight.run(tmp_path / "straight", quiet)
+    broken = OfflineLearner(config(name, kind), mapped)
+    assert broken.expected == straight.expected
+    with pytest.raises(KeyboardInterrupt):
+        broken.run(tmp_path / "broken", interrupt_at(6))
+    resumed = OfflineLearner.resume(tmp_path / "broken", mapped)
+    assert resumed is not None
+    resumed.run(tmp_path / "broken", quiet)
+    assert equal(copies(resumed.agent.networks), copies(straight.agent.networks))
+    assert rows(tmp_path / "broken") == rows(tmp_path / "straight")  # the distance to the data included
+    documents = [load_checkpoint(tmp_path / run / "checkpoint").document for run in ("straight", "broken")]
+    assert documents[0] == documents[1]
+
+
+def test_mapped_data_of_another_digest_are_refused(tmp_path: Path, flown: Transitions) -> None:
+    OfflineLearner(config(updates=1), flown).run(tmp_path, quiet)
+    other = save_mapped(tmp_path / "other.mapped", [flown.take(np.arange(len(flown) - 1))], SCENARIO)
+    with pytest.raises(CheckpointError, match="other data"):
+        OfflineLearner.resume(tmp_path, other)
+
+
+def test_statistics_of_mapped_data_are_of_a_sample_and_extremes_and_minibatches_of_all(
+    flown: Transitions, mapped: MappedTransitions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("uavrl.training.offline.SAMPLE_ROWS", 20)
+    plain = {"reward": {"transform": "zscore", "clip": None}, "discount_per": "second"}
+    learner = OfflineLearner(config(kind="mlp", agent=plain), mapped)
+    known = mapped.sample(20)
+    assert len(learner.sample) == 20
+    assert learner.shift == pytest.approx(float(known.reward.mean()))
+    assert learner.expected.reward_deviation == pytest.approx(1.0, rel=1e-3)
+    means = [value for name, value in learner.agent.networks.state_dict().items() if name.endswith("normaliser.mean")]
+    np.testing.assert_allclose(means[0][:2].numpy(), known.position_m.mean(axis=0), rtol=1e-3)
+    assert known.reward.min() > flown.reward.min()
+    lowest = (float(flown.reward.min()) - learner.shift) / float(known.reward.std())
+    assert learner.rewards[0] == pytest.approx(lowest, rel=1e-3)
+    assert learner.shortest_s == float(flown.duration_s.min())
+    assert len(learner.data) == 60
+    learner.step()
+    assert learner.support_distance() > 0
+
+
+LIMITED = """
+import resource, sys
+from pathlib import Path
+from tests.training.test_offline import config, quiet
+from uavrl.datasets import load_source
+from uavrl.training import offline
+
+offline.SAMPLE_ROWS = 2_000
+log, _ = load_source(sys.argv[1])
+run = config(kind="mlp", updates=3)
+offline.OfflineLearner(run, log.take(slice(0, 100))).run(Path(sys.argv[1] + ".warm"), quiet)  # what torch needs once
+with open("/proc/self/status") as status:
+    used = next(int(line.split()[1]) for line in status if line.startswith("VmData")) << 10
+resource.setrlimit(resource.RLIMIT_DATA, (used + (30 << 20), resource.RLIM_INFINITY))
+data = log if sys.argv[2] == "mapped" else log.take(slice(None))
+offline.OfflineLearner(run, data).run(Path(sys.argv[1] + ".run"), quiet)
+print("trained")
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="limits and /proc as Linux has them")
+def test_mapped_data_train_in_less_memory_than_they_take(tmp_path: Path) -> None:
+    """30 MB more than before the data, which are 46 MB on disk; as tensors they do not fit."""
+    part = fly(SCENARIO, environments=500, steps=24)
+    episodes = int(part.episode.max()) + 1
+    parts = (Transitions(**part.columns() | {"episode": part.episode + i * episodes}) for i in range(25))
+    save_mapped(tmp_path / "log.mapped", parts, SCENARIO)
+    assert (tmp_path / "log.mapped" / "rows.npy").stat().st_size > 40e6
+    root = Path(__file__).parents[2]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join([str(root / "src"), str(root)])}
+    for how in ("mapped", "in memory"):
+        command = [sys.executable, "-c", LIMITED, str(tmp_path / "log.mapped"), how]
+        run = subprocess.run(command, env=environment, cwd=root, capture_output=True, text=True, check=False)
+        if how == "mapped":
+            assert run.stdout == "trained\n", run.stderr
+        else:
+            assert run.returncode != 0
+            assert "llocat" in run.stderr  # of torch's "can't allocate" or NumPy's "Unable to allocate"
