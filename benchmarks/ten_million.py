@@ -29,12 +29,11 @@ from statistics import median
 from threading import Event, Thread
 from typing import Any
 
-import numpy as np
 import torch
 
 from uavrl.agents.registry import preset
 from uavrl.benchmarks.timing import machine
-from uavrl.datasets import Transitions, load_source, save_mapped, select
+from uavrl.datasets import MappedTransitions, Transitions, load_source, save_mapped, select
 from uavrl.training.batches import MappedRows, to_batch
 from uavrl.training.fit import Rows
 from uavrl.training.offline import OfflineLearner, TrainConfig
@@ -129,17 +128,17 @@ def train(source: str, updates: int) -> dict[str, Any]:
 
 
 def sample_unread(path: Path, samples: int) -> dict[str, Any]:
-    """Minibatches of data of which no page is in the page cache when the first is drawn."""
+    """Minibatches from the disk: no page is in the page cache when the first is drawn, and hardly one is met again."""
     evict(path)
     log, scenario = load_source(path)
+    if not isinstance(log, MappedTransitions):
+        raise TypeError(f"{path} is not mapped")
     timed = Timed(MappedRows(log, lambda rows: to_batch(rows, "devices", scenario)))
     generator = torch.Generator().manual_seed(0)
     for _ in range(samples):
         timed.take(torch.randint(0, len(log), (256,), generator=generator))
-    return {
-        "first_sample_ms": 1e3 * timed.seconds[0],
-        "tens_s": np.add.reduceat(timed.seconds, range(0, samples, 10)).tolist(),
-    }
+    slowest = 1e3 * max(timed.seconds)
+    return {"samples": samples, "sample_ms": 1e3 * median(timed.seconds), "slowest_sample_ms": slowest}
 
 
 def evict(path: Path) -> None:

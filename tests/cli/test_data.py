@@ -3,6 +3,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from tests.datasets.flights import fly, small_scenario
@@ -45,6 +48,47 @@ def test_convert_goes_to_minari_and_back(
     assert scenario == flown[2]
 
 
+def test_convert_makes_a_map_and_show_reads_every_byte_of_it(
+    flown: tuple[Path, Transitions, Scenario], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / "log.mapped"
+    assert main(["data", "convert", str(flown[0]), str(target)]) == 0
+    assert capsys.readouterr().out == f"{target}: MappedTransitions(120 rows, K = 3)\n"
+    assert load_source(target)[0].digest() == flown[1].digest()
+    words = ["data", "select", str(target), "--size", "40", "--quality", "bad", "--out", str(tmp_path / "bad.mapped")]
+    assert main(words) == 0
+    assert load_source(tmp_path / "bad.mapped")[0].digest() == select(flown[1], 40, "bad").digest()
+    assert main(["data", "show", str(target)]) == 0
+    rows = target / "rows.npy"
+    rows.write_bytes(rows.read_bytes()[:-1] + b"?")
+    capsys.readouterr()
+    assert main(["data", "show", str(target)]) == 2
+    complaint = capsys.readouterr().err
+    assert "log.mapped: damaged" in complaint
+    assert complaint.count("\n") == 1
+
+
+def test_a_bad_value_stops_a_conversion_with_the_sources_name_and_leaves_nothing(
+    flown: tuple[Path, Transitions, Scenario], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    columns = flown[1].columns()
+    wrong = columns["reward"].copy()
+    wrong[70] = 3.0
+    np.savez(tmp_path / "wrong.npz", **columns | {"reward": wrong})  # type: ignore[arg-type]  # taken for a flag
+    pq.write_table(
+        pa.table({name: (wrong if name == "reward" else values).tolist() for name, values in columns.items()}),
+        tmp_path / "wrong.parquet",
+    )
+    (tmp_path / "my.toml").write_text(flown[2].to_toml())
+    for name in ("wrong.parquet", "wrong.npz"):
+        words = [str(tmp_path / name), str(tmp_path / "log.mapped"), "--scenario", str(tmp_path / "my.toml")]
+        assert main(["data", "convert", *words]) == 2
+        complaint = capsys.readouterr().err
+        assert f"{name}: row 70 (episode 5, step 10), column 'reward' = 3, allowed: -" in complaint
+        assert complaint.count("\n") == 1
+        assert not list(tmp_path.glob("*log.mapped*"))
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -52,6 +96,9 @@ def test_convert_goes_to_minari_and_back(
         (["show", "LOG", "--scenario", "released"], "allowed: "),
         (["select", "LOG", "--size", "121", "--out", "out.npz"], "size = 121, allowed: 1 to 120"),
         (["select", "LOG", "--size", "10", "--out", "out.csv"], "suffix '.csv', allowed: .parquet, .npz"),
+        (["convert", "LOG", "OUT/full.mapped"], "full.mapped: exists, choose another name or remove it first"),
+        (["show", "OUT/full.mapped"], "full.mapped: no whole directory of mapped flights: scenario.toml"),
+        (["show", "OUT/none.mapped"], "none.mapped: no such directory"),
         (["convert", "LOG", "no version"], "dataset id 'no version', allowed"),
         (["show", "LOG", "--json", "LOG/figures.json"], "figures.json"),
     ],
@@ -59,7 +106,9 @@ def test_convert_goes_to_minari_and_back(
 def test_wrong_input_gets_one_line_and_code_2(
     flown: tuple[Path, Transitions, Scenario], words: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["data", *(word.replace("LOG", str(flown[0])) for word in words)]) == 2
+    out = flown[0].parent
+    (out / "full.mapped").mkdir()
+    assert main(["data", *(word.replace("LOG", str(flown[0])).replace("OUT", str(out)) for word in words)]) == 2
     complaint = capsys.readouterr().err
     assert message in complaint
     assert complaint.count("\n") == 1

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tests.agents.problems import equal
 from tests.datasets.flights import fly, small_scenario
 from uavrl.cli import main
 from uavrl.cli.train import trial_flights
@@ -51,6 +52,38 @@ def test_a_flat_file_becomes_a_policy(folder: Path, agent: str, capsys: pytest.C
     assert [row["step"] for row in rows] == [1, 2, 3, 4]
     assert all(row["support_distance"] > 0 for row in rows)
     assert "health unknown: 4 rows in the log" in captured.out
+
+
+def test_mapped_flights_train_to_the_same_policy_and_resume(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from uavrl.training.offline import OfflineLearner
+
+    assert main(["data", "convert", "log.parquet", "log.mapped"]) == 0
+    words = ["bc", "--updates", "4", "--evaluate-every", "4", *SMALL]
+    assert train(*words, "--out", "flat", "--data", "log.parquet") == 0
+    words += ["--out", "run", "--data", "log.mapped"]
+    real = OfflineLearner.step
+
+    def step(self: OfflineLearner) -> object:
+        if self.updates == 1:
+            signal.raise_signal(signal.SIGINT)
+        return real(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(OfflineLearner, "step", step)
+        assert train(*words) == 130
+    assert train(*words, "--resume") == 0
+    assert "4 updates on 60 transitions" in capsys.readouterr().out
+    assert (folder / "run/metrics.jsonl").read_text() == (folder / "flat/metrics.jsonl").read_text()
+    networks = [load_checkpoint(folder / run / "checkpoint").tensors["networks"] for run in ("flat", "run")]
+    assert equal(networks[0], networks[1])
+    rows = folder / "log.mapped/rows.npy"
+    rows.write_bytes(rows.read_bytes()[:-9])
+    assert train(*words, "--resume") == 2
+    complaint = capsys.readouterr().err
+    assert "log.mapped/rows.npy: missing, cut short or damaged" in complaint
+    assert complaint.count("\n") == 1
 
 
 def test_a_run_ends_with_a_line_on_its_health(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ import torch
 
 from tests.datasets.flights import fly, small_scenario
 from uavrl.agents.base import Batch, RewardConfig
+from uavrl.datasets import save_mapped
 from uavrl.scenario import load_scenario
 from uavrl.simulation.environment import observe
 from uavrl.simulation.observations import ObservationKind
@@ -58,11 +60,12 @@ def test_a_truncated_flight_goes_on_in_the_batch_and_a_drained_battery_ends_it()
 
 
 @pytest.mark.parametrize("kind", ["paper", "devices"])
-def test_rows_read_one_by_one_are_those_taken_from_all_to_the_last_bit(kind: ObservationKind) -> None:
+def test_rows_read_one_by_one_are_those_taken_from_all_to_the_last_bit(kind: ObservationKind, tmp_path: Path) -> None:
     scenario = small_scenario(energy_budget_j=200.0)
     log = fly(scenario, steps=20)
     data, rows = to_batch(log, kind, scenario), torch.tensor([50, 3, 3, 0, 59, 50])
-    mapped = MappedRows(log, lambda part: to_batch(part, kind, scenario))
+    on_disk = save_mapped(tmp_path / "log.mapped", [log], scenario)
+    mapped = MappedRows(on_disk, lambda part: to_batch(part, kind, scenario))
     assert len(mapped) == len(data) == 60
 
     def tensors(batch: Batch) -> list[torch.Tensor]:

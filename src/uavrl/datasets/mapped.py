@@ -13,6 +13,7 @@ All is validated while it is written, under a temporary name, then renamed. Open
 
 from __future__ import annotations
 
+import mmap
 import os
 import shutil
 from collections.abc import Iterable
@@ -50,6 +51,7 @@ class MappedTransitions(Transitions):
     """Transitions whose columns lie on disk; rows come into memory when they are taken by an index."""
 
     sha256: str  # of all columns, as they were written
+    pages: mmap.mmap  # that the columns are views of
 
     def __repr__(self) -> str:
         return f"MappedTransitions({len(self):,} rows, K = {self.devices})"
@@ -66,6 +68,10 @@ class MappedTransitions(Transitions):
         """
         if super().digest() != self.sha256:
             raise DatasetError(f"{source}: damaged, its columns are not those that were written; convert it again")
+
+    def expect_random_rows(self) -> None:
+        """From now on read the page that holds a row, and not, as files are read, megabytes around it."""
+        self.pages.madvise(mmap.MADV_RANDOM)
 
     def sample(self, size: int, seed: int = 0) -> Transitions:
         """`size` rows in their order, drawn without replacement, all where there are fewer; in memory."""
@@ -181,7 +187,8 @@ def open_mapped(path: str | Path) -> MappedTransitions:
         field = ".".join(str(place) for place in reason["loc"])
         raise DatasetError(f"{path / MANIFEST}: damaged or of another version: {field} {reason['msg']}") from None
     rows = _map(path / _ROWS, manifest)
-    return MappedTransitions(**{name: rows[name] for name in COLUMNS}, sha256=manifest.sha256)
+    columns: dict[str, NDArray[Any]] = {name: rows[name] for name in COLUMNS}
+    return MappedTransitions(**columns, sha256=manifest.sha256, pages=rows.base)
 
 
 def scenario_text(path: str | Path) -> str:
@@ -202,8 +209,8 @@ def _read(path: Path, name: str) -> str:
         raise DatasetError(f"{path}: no whole directory of mapped flights: {name} cannot be read: {error}") from None
 
 
-def _map(file: Path, manifest: _Manifest) -> NDArray[Any]:
-    """The rows (n,); their columns are views."""
+def _map(file: Path, manifest: _Manifest) -> Any:
+    """The rows (n,), an array on a map of the file, which is its `base`."""
     try:
         rows = np.lib.format.open_memmap(file, mode="r")
     except (OSError, ValueError, EOFError) as error:
@@ -214,4 +221,4 @@ def _map(file: Path, manifest: _Manifest) -> NDArray[Any]:
         raise DatasetError(f"{file}: holds other columns or rows than {MANIFEST} says")
     if file.stat().st_size != rows.offset + rows.nbytes:
         raise DatasetError(f"{file}: has more bytes than its {manifest.rows:,} rows")
-    return np.asarray(rows)
+    return rows

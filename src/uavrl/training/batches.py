@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from uavrl.actions import HybridAction
 from uavrl.agents.base import Batch, RewardConfig
+from uavrl.datasets.mapped import MappedTransitions
 from uavrl.datasets.transitions import Transitions
 from uavrl.networks import Observation, Spaces
 from uavrl.scenario import Scenario
@@ -54,7 +55,7 @@ def to_batch(transitions: Transitions, kind: ObservationKind, scenario: Scenario
 
 
 class MappedRows:
-    """Transitions that stay where they are: a minibatch's rows are read and encoded when it is drawn.
+    """Transitions that stay on disk: a minibatch's rows are read and encoded when it is drawn.
 
     Whatever `take` answers is equal, bit for bit, to what it would take from all rows encoded at once.
 
@@ -63,7 +64,8 @@ class MappedRows:
         encode: from rows in memory to the batch an agent sees, each row by itself.
     """
 
-    def __init__(self, transitions: Transitions, encode: Callable[[Transitions], Batch]) -> None:
+    def __init__(self, transitions: MappedTransitions, encode: Callable[[Transitions], Batch]) -> None:
+        transitions.expect_random_rows()
         self.transitions = transitions
         self.encode = encode
 

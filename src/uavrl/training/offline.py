@@ -82,6 +82,8 @@ class OfflineLearner:
             raise ConfigError("device = 'cuda', but torch finds no GPU; allowed here: 'cpu'")
         self.config, self.device = config, torch.device(device)
         kind = OBSERVATION_OF[config.agent.network.kind]
+        least, most = transitions.reward.min(), transitions.reward.max()  # first: mapped files are read in order
+        self.shortest_s = float(transitions.duration_s.min())
         known = transitions.sample(SAMPLE_ROWS) if isinstance(transitions, MappedTransitions) else transitions
         terminates = config.scenario.limits.energy_budget_j is not None
         reward = config.agent.reward
@@ -105,10 +107,11 @@ class OfflineLearner:
         self.agent.networks.to(self.device)
         compile_passes(self.agent, config.compilation, self.device)
         self.sample = sample.to(self.device)  # what statistics are of
-        self.data: Rows = self.sample if known is transitions else MappedRows(transitions, encode)
-        extremes = seen(torch.tensor([transitions.reward.min(), transitions.reward.max()]))
+        self.data: Rows = self.sample
+        if isinstance(transitions, MappedTransitions):
+            self.data = MappedRows(transitions, encode)
+        extremes = seen(torch.tensor([least, most]))
         self.rewards = (float(extremes[0]), float(extremes[1]))  # the least and the most that the agent is given
-        self.shortest_s = float(transitions.duration_s.min())
         self.generator = torch.Generator(self.device).manual_seed(config.seed)
         self.digest = transitions.digest()
         self.updates = 0
