@@ -61,7 +61,7 @@ def gaussian_decision(actor: ChoiceActor, observation: Observation, noise: Tenso
 def drawn_choice(logits: Tensor, noise: Tensor) -> Tensor:
     """A sample (B,) of softmax(logits), (B, D), from standard normal noise (B, D).
 
-    As torch.multinomial draws it: the first of D exponential clocks of rates softmax(logits), here -log(1 - Phi(noise)).
+    As torch.multinomial draws it: the first of D clocks, exponential by -log(1 - Phi(noise)), at rates softmax(logits).
     """
     left = 0.5 * (1.0 + torch.erf(noise * -math.sqrt(0.5)))
     clock = -torch.log(left.clamp(1e-30, 1.0 - 2.0**-24))  # finite: a padded device must not win

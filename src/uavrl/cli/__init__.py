@@ -42,7 +42,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "bench train": Command("uavrl.cli.bench:BenchTrain", "measure updates a second, beside what the products allow"),
     "bench decide": Command(
-        "uavrl.cli.bench:BenchDecide", "measure an exported policy's decisions, beside their floors"
+        "uavrl.cli.bench:BenchDecide", "measure decisions of exported policies, beside their floors"
     ),
     "demo": Command("uavrl.cli.demo:Demo", "learn a small policy, judge it, and show it"),
     "watch": Command("uavrl.cli.watch:Watch", "make a web page of one flight of a policy"),

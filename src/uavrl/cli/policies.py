@@ -17,8 +17,7 @@ from uavrl.scenario import Scenario
 
 
 def resolve(spec: str, scenario: Scenario) -> Policy:
-    """A heuristic by name, a trained policy by its checkpoint's directory, an exported one by its file, your own as
-    `module:Class`.
+    """A heuristic by name, a checkpoint by its directory, an exported policy by its file, your own as `module:Class`.
 
     Raises:
         ConfigError: there is no such policy, or `module:Class` cannot be imported or is no policy.
