@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import json
+import logging
 import os
 import warnings
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -144,8 +145,7 @@ def _inputs(scenario: Scenario, agent: Agent) -> dict[str, Any]:
 
 def _traced(module: nn.Module, names: list[str], example: list[Tensor], free: list[dict[int, Any]]) -> Any:
     """The model of onnx; what the exporter says meanwhile is for its own developers."""
-    silence = io.StringIO()
-    with torch.no_grad(), warnings.catch_warnings(), contextlib.redirect_stdout(silence):
+    with torch.no_grad(), warnings.catch_warnings(), _silence():
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
             module,
@@ -161,7 +161,23 @@ def _traced(module: nn.Module, names: list[str], example: list[Tensor], free: li
         )
     if program is None:
         raise RuntimeError("torch.onnx.export returned no program")
-    return program.model_proto
+    model = program.model_proto
+    graph = model.graph
+    del graph.value_info[:]  # this and the next: shapes and stack traces of the tracing, larger than the weights
+    for part in (*graph.node, *graph.input, *graph.output, *graph.initializer, graph, model):
+        del part.metadata_props[:]
+        part.ClearField("doc_string")
+    return model
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        yield
+    finally:
+        logging.disable(before)
 
 
 def _sort(x: Any, stable: bool, dim: int, descending: bool) -> Any:

@@ -29,9 +29,7 @@ class ExportedPolicy:
         self.name = f"{info['agent']} (exported)"
         self.needs: Literal["paper", "devices", "state"] = "devices" if info["network"] == "devices" else "paper"
         if self.needs == "paper" and info["devices"] != devices:
-            raise ConfigError(
-                f"policy '{path}' is a perceptron for devices = {info['devices']}, the scenario has {devices}"
-            )
+            raise ConfigError(f"policy '{path}' takes devices = {info['devices']} alone, the scenario has {devices}")
         self.devices = devices
 
     def reset(self, count: int) -> None:

@@ -43,9 +43,8 @@ def verify(trained: Policy, exported: Policy, environments: EvaluationSet, *, de
     """Fly both; a file that samples takes other noise than the checkpoint, so only its mean is comparable."""
 
     def returns(policy: Policy, wanted: bool) -> NDArray[np.float64]:
-        total: NDArray[np.float64] = fly(policy, environments, deterministic=wanted, show_progress=True).reward.sum(
-            axis=0
-        )
+        flights = fly(policy, environments, deterministic=wanted, show_progress=True)
+        total: NDArray[np.float64] = (flights.reward * flights.active).sum(axis=0)
         return total
 
     return Verification(returns(trained, deterministic), returns(exported, deterministic))
