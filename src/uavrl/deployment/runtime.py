@@ -176,6 +176,10 @@ class Policy:
         valid = devices[..., -1] == 1.0
         if not valid.all():
             padded = devices[..., -1] == 0.0
+            if not (valid | padded).all():
+                place = tuple(np.argwhere(~(valid | padded))[0])
+                where = ", ".join(str(index) for index in (*place, devices.shape[-1] - 1))
+                raise PolicyError(f"devices[{where}], valid = {devices[..., -1][place]:g}, allowed: 0 or 1")
             devices = np.where(padded[..., None], 0.0, devices)
             # an average over no device has no value: let one in, and overrule the answer
             lost = padded.all(axis=-1, keepdims=True)
