@@ -94,6 +94,11 @@ class DiffusionActor(nn.Module):
             gradient_steps=gradient_steps,
         )
 
+    def map(self, denoiser: Denoiser, context: Context, start: Tensor) -> Tensor:
+        """x_0 (N, C + D) that DDIM without noise makes of x_M = start (N, C + D)."""
+        predict = self._chain(denoiser, context, start.device)
+        return ddim(predict, self.schedule(start.device), start, None, clip_x0=self.config.clip_x0)
+
     def _chain(self, denoiser: Denoiser, context: Context, device: torch.device) -> ChainDenoiser:
         """The network as the samplers call it, with the parts of s and of all steps computed here, once."""
         steps = denoiser.steps(torch.arange(1, self.config.steps + 1, device=device)).split(1)
@@ -112,10 +117,8 @@ class DiffusionActor(nn.Module):
     def decide(self, context: Context, noise: ChainNoise | None) -> HybridAction:
         """One action a row by the average network; without noise: DDIM from zero."""
         if noise is None:
-            device = context[0].device
-            start = torch.zeros((context[0].shape[0], self.average.vector_size(context)), device=device)
-            predict = self._chain(self.average, context, device)
-            vector = ddim(predict, self.schedule(device), start, None, clip_x0=self.config.clip_x0)
+            size = (context[0].shape[0], self.average.vector_size(context))
+            vector = self.map(self.average, context, torch.zeros(size, device=context[0].device))
         else:
             vector = self.sample(self.average, context, noise)
         return decode(self.average.possible(context, vector), self.continuous)

@@ -302,9 +302,11 @@ class DiffusionSac(Agent):
 
     def _decide(self, observation: Observation, context: Context, noise: ChainNoise | None) -> HybridAction:
         """The best of a row's candidates, whose encodings stand one after another in `context`; 1 without noise."""
-        config, count = self.config, 1 if noise is None else self.config.candidates
-        drawn = self.actor.decide(context, noise)
-        if count == 1 and not config.greedy_choice:
+        return self.best(observation, self.actor.decide(context, noise), 1 if noise is None else self.config.candidates)
+
+    def best(self, observation: Observation, drawn: HybridAction, count: int) -> HybridAction:
+        """Of each row's `count` drawn actions, one after another, that of largest min Q; its choice as configured."""
+        if count == 1 and not self.config.greedy_choice:
             return drawn
         q, choice = self._best(self.critic, repeat(self.critic.encode(observation), count), drawn)
         if count == 1:

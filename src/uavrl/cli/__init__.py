@@ -34,6 +34,7 @@ COMMANDS: dict[str, Command] = {
     "data convert": Command("uavrl.cli.data:DataConvert", "write logged flights in another form"),
     "collect": Command("uavrl.cli.collect:Collect", "log the flights of an agent that learns online"),
     "train": Command("uavrl.cli.train:Train", "learn a policy from logged flights alone"),
+    "distill": Command("uavrl.cli.distill:Distill", "teach a policy of one pass what a Diffusion-SAC decides"),
     "evaluate": Command("uavrl.cli.evaluate:Evaluate", "fly policies on equal layouts, starts and fading"),
     "export": Command("uavrl.cli.export:Export", "write a policy as one file that flies without torch"),
     "ablate": Command("uavrl.cli.ablate:Ablate", "change one setting of Diffusion-SAC at a time and measure"),
