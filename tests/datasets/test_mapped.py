@@ -136,7 +136,7 @@ def test_another_scenario_is_validated_and_the_stored_one_is_not_again(
     with pytest.raises(DatasetError, match="K = 3 devices, allowed: 10"):
         load_source(path, "released")
     assert load_source(path, scenario.replace(name="renamed"))[1].name == "renamed"
-    monkeypatch.setattr("uavrl.datasets.mapped.validated", None)
+    monkeypatch.setattr("uavrl.datasets.flat.validated", None)
     load_source(path, scenario)
     load_source(path)
 

@@ -1,4 +1,4 @@
-"""Flat files: Parquet, npz or a directory of columns, those of `COLUMNS`, one row a transition."""
+"""Flat data: Parquet, npz or a .mapped directory, with the columns of `COLUMNS`, one row a transition."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ import pyarrow.parquet as pq
 from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
-from uavrl.datasets.mapped import load_mapped, save_mapped, scenario_text
+from uavrl.datasets.mapped import open_mapped, save_mapped, scenario_text
 from uavrl.datasets.transitions import COLUMNS, PART_ROWS, Transitions
-from uavrl.datasets.validation import validate
+from uavrl.datasets.validation import validate, validated
 from uavrl.errors import DatasetError
 from uavrl.scenario import Scenario, parse_scenario
 
@@ -102,14 +102,18 @@ def load_flat(path: str | Path, scenario: Scenario) -> Transitions:
     """Read and validate Parquet or npz, of ours or of a user; numbers may be of any type and width.
 
     `layout_m` holds x and y of each device in turn, 2K a row; (n, K, 2) is read as well. Other columns are ignored.
-    A directory of columns is mapped, see `load_mapped`.
+    A .mapped directory was validated when it was written; it is again, part by part, under another scenario than then.
 
     Raises:
         DatasetError: a file that cannot be read, a missing column, or what `validate` refuses: file, row and column.
     """
     path = Path(path)
     if path.suffix == ".mapped":
-        return load_mapped(path, scenario)
+        mapped = open_mapped(path)
+        if scenario != stored_scenario(path):
+            for _ in validated(mapped.parts(), scenario, str(path)):
+                pass
+        return mapped
     columns, _ = _read(path)
     transitions = _transitions(path, columns, scenario)
     validate(transitions, scenario, str(path))

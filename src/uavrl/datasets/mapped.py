@@ -158,19 +158,6 @@ def _sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def load_mapped(path: str | Path, scenario: Scenario) -> MappedTransitions:
-    """As `open_mapped`; all rows are validated, part by part, only under another scenario than they were written with.
-
-    Raises:
-        DatasetError: as of `open_mapped` and `validate`.
-    """
-    transitions = open_mapped(path)
-    if scenario.to_toml() != scenario_text(path):
-        for _ in validated(transitions.parts(), scenario, str(path)):
-            pass
-    return transitions
-
-
 def open_mapped(path: str | Path) -> MappedTransitions:
     """Map what `save_mapped` wrote.
 
