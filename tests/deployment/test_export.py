@@ -51,8 +51,8 @@ def logged_and_random(kind: Kind) -> Observation:
 def agree(expected: Any, found: Any, reach_m: float = 25.0, ties: int = 5) -> None:
     """Equal choices, and displacements to a tenth of a millimetre, but for ties.
 
-    A tie is broken another way by another rounding: another choice, or another candidate. One displacement in a hundred may
-    be a few times that apart: through weights as wild as these, torch's own float32 is as far from float64.
+    A tie is broken another way by another rounding: another choice, or another candidate. One displacement in a
+    hundred may be further apart: through weights as wild as these, torch's own float32 is as far from float64.
     """
     apart_m = np.abs(expected.continuous.numpy() * reach_m - found.displacement_m).max(axis=1)
     tied = (expected.choice.numpy() != found.device) | (apart_m > 0.01)
