@@ -9,7 +9,12 @@ from types import ModuleType
 import pytest
 import torch
 
-from uavrl.agents.registry import PRESETS
+from uavrl.agents.gaussian_bc import GaussianBcConfig
+from uavrl.agents.registry import PRESETS, make_agent
+from uavrl.deployment.export import export
+from uavrl.networks import NetworkConfig
+from uavrl.scenario import load_scenario
+from uavrl.training.batches import spaces_of
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -30,7 +35,7 @@ def load(name: str) -> ModuleType:
 
 
 def test_every_example_has_a_test() -> None:
-    assert [path.stem for path in sorted(EXAMPLES.glob("*.py"))] == ["own_environment"]
+    assert [path.stem for path in sorted(EXAMPLES.glob("*.py"))] == ["fly_exported", "own_environment"]
 
 
 def test_an_agent_learns_an_environment_of_ones_own(capsys: pytest.CaptureFixture[str]) -> None:
@@ -52,3 +57,14 @@ def test_the_example_names_every_agent_and_knows_nothing_of_uavs() -> None:
     assert f"[{'|'.join(sorted(PRESETS))}]" in text
     for room in ("scenario", "physics", "simulation", "datasets", "evaluation"):
         assert f"uavrl.{room}" not in text
+
+
+def test_an_exported_policy_flies(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "policy.onnx"
+    network = NetworkConfig(kind="mlp", width=8, depth=1)
+    scenario = load_scenario("released")
+    agent = make_agent(spaces_of(scenario, "mlp"), GaussianBcConfig(network=network))
+    export(agent, scenario, path)
+    total = load("fly_exported").main(str(path))
+    assert -1e5 < total < 0
+    assert capsys.readouterr().out == f"Policy('gaussian_bc', scenario='released', K = 10): return {total:.1f}\n"

@@ -6,8 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from uavrl.benchmarks import simulate, train
+from uavrl.agents.diffusion_sac import DiffusionSacConfig
+from uavrl.benchmarks import decide, simulate, train
 from uavrl.cli import main
+from uavrl.networks import NetworkConfig
 
 
 @pytest.fixture(autouse=True)
@@ -46,6 +48,32 @@ def test_training_is_measured_beside_its_products(
     assert found["machine"]["threads"] == 1
     share = 100 * found["default_updates_per_s"] / found["default_updates_floor_per_s"]
     assert f"{share:.1f}% of the" in capsys.readouterr().out
+
+
+def test_decisions_are_measured_beside_their_products(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = NetworkConfig(kind="mlp", width=32, depth=1)
+    whole = decide.settings
+    monkeypatch.setattr(decide, "settings", lambda case: whole(case).model_copy(update={"network": small}))
+    monkeypatch.setattr(decide, "CASES", {"five_step": decide.Case("paper", 2)})
+    file = tmp_path / "a.json"
+    assert main(["bench", "decide", "--seconds", "0.05", "--json", str(file)]) == 0
+    found = json.loads(file.read_text())
+    assert 0 < found["five_step_floor_ms"] < found["five_step_ms"] <= found["five_step_p99_ms"]
+    assert found["five_step_batch_decisions_per_s"] > 1e3 / found["five_step_ms"]  # or a batch would be no use
+    assert "one_step_ms" not in found  # there is no such policy yet
+    assert f"{found['five_step_ms']:.3g} ms in the median" in capsys.readouterr().out
+
+
+def test_the_decisions_measured_are_of_five_and_fifty_steps() -> None:
+    chains = {name: decide.settings(case) for name, case in decide.CASES.items()}
+    assert all(isinstance(chain, DiffusionSacConfig) for chain in chains.values())
+    assert {name: (chain.network.kind, chain.diffusion.steps) for name, chain in chains.items()} == {
+        "five_step": ("mlp", 5),
+        "fifty_step": ("mlp", 50),
+        "default": ("devices", 5),
+    }
 
 
 @pytest.mark.parametrize(

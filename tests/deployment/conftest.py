@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.agents.problems import Kind, agent
+from tests.agents.problems import Kind, agent, disturb
 from uavrl.agents.base import Agent
 from uavrl.deployment.export import export
 from uavrl.scenario import load_scenario
@@ -22,6 +22,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
         key = (name, kind, sampled, devices)
         if key not in made:
             one = agent(name, kind, devices=devices)
+            disturb(one.networks, 1)  # as they come, some of them choose one device wherever they are
             path = tmp_path_factory.mktemp("exported") / "policy.onnx"
             scenario = load_scenario("released", devices=devices, max_steps=20)
             export(one, scenario, path, sampled=sampled, facts={"seed": 3})
