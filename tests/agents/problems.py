@@ -10,15 +10,18 @@ from torch import Tensor, nn
 from uavrl.actions import HybridAction
 from uavrl.agents.base import Agent, Batch
 from uavrl.agents.diffusion_actor import DiffusionConfig
-from uavrl.agents.diffusion_sac import DiffusionSac
+from uavrl.agents.diffusion_sac import DiffusionSac, DiffusionSacConfig
+from uavrl.agents.one_step import OneStepConfig
 from uavrl.agents.registry import PRESETS, make_agent
 from uavrl.agents.sac import SacConfig
 from uavrl.networks import NetworkConfig, Observation, Spaces, fit_normalisers
 
 Kind = Literal["mlp", "devices"]
 KINDS: tuple[Kind, ...] = ("mlp", "devices")
-NAMES = ("sac", "diffusion_sac", "cql", "iql", "bcq", "bc", "gaussian_bc")
-CONFIGS = {"sac": SacConfig} | {name: type(presets["default"]) for name, presets in PRESETS.items()}
+NAMES = ("sac", "diffusion_sac", "cql", "iql", "bcq", "bc", "gaussian_bc", "one_step")
+CONFIGS: dict[str, Any] = {"sac": SacConfig, "one_step": OneStepConfig} | {
+    name: type(presets["default"]) for name, presets in PRESETS.items()
+}
 DEVICES = 4
 
 
@@ -69,6 +72,9 @@ def batch(kind: Kind, rows: int, seed: int = 0, devices: int = DEVICES) -> Batch
 
 def agent(name: str, kind: Kind, *, seed: int = 0, devices: int = DEVICES, **changes: Any) -> Agent:
     shape = network(kind, **changes.pop("network", {}))
+    if name == "one_step":
+        changes = {"teacher": DiffusionSacConfig(network=shape, diffusion=DiffusionConfig(steps=3))} | changes
+        shape = changes["teacher"].network
     config = CONFIGS[name](network=shape, **changes)
     torch.manual_seed(seed)
     made = make_agent(spaces(kind, devices), config)

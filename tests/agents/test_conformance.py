@@ -73,7 +73,8 @@ def test_update_reports_finite_numbers_and_moves_what_it_trains(name: str, kind:
         assert all(value == value and abs(value) < 1e6 for value in metrics.values()), metrics
         assert metrics["actor_gradient"] > 0
     for key, part in made.networks.items():
-        assert not equal(before[key], copies(part)), key
+        taught = name == "one_step" and key in ("teacher", "critic")
+        assert equal(before[key], copies(part)) == taught, key
 
 
 @ALL
@@ -93,7 +94,7 @@ def test_actions_are_legal_and_come_from_the_generator_alone(name: str, kind: Ki
     assert torch.equal(first.continuous, again.continuous)
     assert torch.equal(first.choice, again.choice)
     assert not torch.equal(first.continuous, other.continuous)
-    if name != "bcq":  # its choice is the argmax of a critic over candidates that differ by their displacement
+    if name not in ("bcq", "one_step"):  # their choice is a critic's, and displacements of little difference
         assert not torch.equal(first.choice, other.choice)
     assert not first.continuous.requires_grad
 

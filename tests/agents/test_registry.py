@@ -18,7 +18,7 @@ from uavrl.networks import NetworkConfig
 def test_every_agent_is_registered_once_and_under_its_own_name() -> None:
     names = [config.model_fields["name"].default for config in AGENTS]
     assert sorted(names) == sorted(NAMES)  # and the conformance suite knows it
-    assert {*PRESETS, "sac"} == set(names)
+    assert {*PRESETS, "sac", "one_step"} == set(names)
     for name, presets in PRESETS.items():
         assert set(presets) == {"default", "paper"}
         assert all(config.name == name for config in presets.values())

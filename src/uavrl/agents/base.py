@@ -116,6 +116,14 @@ class Agent(ABC):
     def act(self, observation: Observation, *, generator: torch.Generator, deterministic: bool = False) -> HybridAction:
         """Actions for B observations."""
 
+    @abstractmethod
+    def noise_shape(self, choices: int) -> tuple[int, int]:
+        """(R, E): rows and entries of noise that a sampled decision between `choices` takes."""
+
+    @abstractmethod
+    def decide(self, observation: Observation, noise: Tensor | None) -> HybridAction:
+        """`act` as a pure function: of standard normal noise (B, R, E), or for None the deterministic action."""
+
 
 def discounts(batch: Batch, config: AgentConfig) -> Tensor:
     """gamma (1 - terminated) of each transition, (B,); gamma^duration where discounting is per second."""

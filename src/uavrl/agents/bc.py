@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from uavrl.actions import HybridAction, encode
 from uavrl.agents.base import Agent, AgentConfig, Batch, Metrics, adam, minimise, move_towards
-from uavrl.agents.diffusion_actor import DiffusionActor, DiffusionConfig, block_mean
+from uavrl.agents.diffusion_actor import ChainNoise, DiffusionActor, DiffusionConfig, block_mean
 from uavrl.diffusion import denoising_loss
 from uavrl.networks import Observation, Spaces
 
@@ -65,3 +65,13 @@ class BehaviourCloning(Agent):
         """A sample of the chain."""
         with torch.no_grad():
             return self.actor.act(self.actor.average.encode(observation), generator, deterministic)
+
+    def noise_shape(self, choices: int) -> tuple[int, int]:
+        """That of a chain: its start and its steps."""
+        return self.config.diffusion.steps + 1, self.spaces.continuous + choices
+
+    def decide(self, observation: Observation, noise: Tensor | None) -> HybridAction:
+        """See `Agent`."""
+        chain = None if noise is None else ChainNoise.of_rows(noise, self.config.diffusion.steps)
+        with torch.no_grad():
+            return self.actor.decide(self.actor.average.encode(observation), chain)

@@ -152,8 +152,8 @@ class Bcq(Agent):
     def judge(self, critic: Critic, observation: Observation, w: Tensor, one_hot: Tensor) -> Tensor:
         """Soft minimum of both Q, (B, N), of N candidates a row."""
         context = critic.encode(observation)
-        rows = len(context[0])
-        q = critic.value(repeat(context, len(w) // rows), w, one_hot)
+        rows = context[0].shape[0]
+        q = critic.value(repeat(context, w.shape[0] // rows), w, one_hot)
         return soft_minimum(q, self.config.soft_minimum).view(rows, -1)
 
     def update(self, batch: Batch, generator: torch.Generator) -> Metrics:
@@ -186,13 +186,23 @@ class Bcq(Agent):
     @torch.no_grad()
     def act(self, observation: Observation, *, generator: torch.Generator, deterministic: bool = False) -> HybridAction:
         """The best of `candidates`; deterministic: of the displacements at z = 0, one for each allowed choice."""
+        if deterministic:
+            return self.decide(observation, None)
+        rows = len(observation["uav"] if isinstance(observation, dict) else observation)
+        shape = (rows, *self.noise_shape(self.spaces.choices))
+        return self.decide(observation, torch.randn(shape, generator=generator, device=generator.device))
+
+    def noise_shape(self, choices: int) -> tuple[int, int]:
+        """z of each candidate."""
+        return self.config.candidates, self.latent
+
+    @torch.no_grad()
+    def decide(self, observation: Observation, noise: Tensor | None) -> HybridAction:
+        """See `Agent`."""
         logits = self.classifier(observation).logits
         rows, choices = logits.shape
-        if deterministic:
+        if noise is None:
             noise = torch.zeros((rows, choices, self.latent), device=logits.device)
-        else:
-            shape = (rows, self.config.candidates, self.latent)
-            noise = torch.randn(shape, generator=generator, device=generator.device)
         w, one_hot = self.propose(observation, logits, noise, self.actor)
         best = self.judge(self.critic, observation, w, one_hot).argmax(dim=1)
         best = best + noise.shape[1] * torch.arange(rows, device=best.device)

@@ -38,6 +38,7 @@ from uavrl.agents.sac import (
     named_pairs,
     soft_action,
     soft_actor_loss,
+    soft_decision,
     soft_target,
     temperature_loss,
 )
@@ -211,3 +212,11 @@ class Cql(Agent):
     def act(self, observation: Observation, *, generator: torch.Generator, deterministic: bool = False) -> HybridAction:
         """A sample of pi, or its mode."""
         return soft_action(self.actor, observation, generator, deterministic)
+
+    def noise_shape(self, choices: int) -> tuple[int, int]:
+        """A number for each entry of w and for each choice."""
+        return 1, self.spaces.continuous + choices
+
+    def decide(self, observation: Observation, noise: Tensor | None) -> HybridAction:
+        """See `Agent`."""
+        return soft_decision(self.actor, observation, noise)

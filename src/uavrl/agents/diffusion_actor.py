@@ -45,6 +45,12 @@ class ChainNoise(NamedTuple):
         both = torch.randn((steps + 1, count, size), generator=generator, device=generator.device)
         return cls(both[0], both[1:])
 
+    @classmethod
+    def of_rows(cls, noise: Tensor, steps: int) -> ChainNoise:
+        """From noise (B, n (M + 1), C + D), that of B x n samples: start, then steps 1..M, of one after another."""
+        both = noise.reshape(-1, steps + 1, noise.shape[-1]).transpose(0, 1)
+        return cls(both[0], both[1:])
+
 
 class DiffusionActor(nn.Module):
     """A denoiser and its exponential moving average, the target actor, which also acts."""
@@ -88,6 +94,11 @@ class DiffusionActor(nn.Module):
             gradient_steps=gradient_steps,
         )
 
+    def map(self, denoiser: Denoiser, context: Context, start: Tensor) -> Tensor:
+        """x_0 (N, C + D) that DDIM without noise makes of x_M = start (N, C + D)."""
+        predict = self._chain(denoiser, context, start.device)
+        return ddim(predict, self.schedule(start.device), start, None, clip_x0=self.config.clip_x0)
+
     def _chain(self, denoiser: Denoiser, context: Context, device: torch.device) -> ChainDenoiser:
         """The network as the samplers call it, with the parts of s and of all steps computed here, once."""
         steps = denoiser.steps(torch.arange(1, self.config.steps + 1, device=device)).split(1)
@@ -96,14 +107,20 @@ class DiffusionActor(nn.Module):
     @torch.no_grad()
     def act(self, context: Context, generator: torch.Generator, deterministic: bool) -> HybridAction:
         """One action a row by the average network; deterministic: DDIM from zero noise."""
-        size, count = self.average.vector_size(context), len(context[0])
-        if deterministic:
-            schedule = self.schedule(generator.device)
-            start = torch.zeros((count, size), device=generator.device)
-            predict = self._chain(self.average, context, generator.device)
-            vector = ddim(predict, schedule, start, None, clip_x0=self.config.clip_x0)
+        return self.decide(context, None if deterministic else self.draw(context, generator))
+
+    def draw(self, context: Context, generator: torch.Generator) -> ChainNoise:
+        """Noise of one sample a row."""
+        return ChainNoise.draw(len(context[0]), self.average.vector_size(context), self.config.steps, generator)
+
+    @torch.no_grad()
+    def decide(self, context: Context, noise: ChainNoise | None) -> HybridAction:
+        """One action a row by the average network; without noise: DDIM from zero."""
+        if noise is None:
+            size = (context[0].shape[0], self.average.vector_size(context))
+            vector = self.map(self.average, context, torch.zeros(size, device=context[0].device))
         else:
-            vector = self.sample(self.average, context, ChainNoise.draw(count, size, self.config.steps, generator))
+            vector = self.sample(self.average, context, noise)
         return decode(self.average.possible(context, vector), self.continuous)
 
 

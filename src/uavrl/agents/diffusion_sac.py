@@ -281,13 +281,37 @@ class DiffusionSac(Agent):
     @torch.no_grad()
     def act(self, observation: Observation, *, generator: torch.Generator, deterministic: bool = False) -> HybridAction:
         """A sample of the target actor's chain, the best of `candidates` by min Q; deterministic: DDIM from zero."""
-        context, config = self.actor.average.encode(observation), self.config
-        count = 1 if deterministic else config.candidates
-        if count == 1 and not config.greedy_choice:
-            return self.actor.act(context, generator, deterministic)
-        drawn = self.actor.act(repeat(context, count), generator, deterministic)
+        context = self.actor.average.encode(observation)
+        if deterministic:
+            return self._decide(observation, context, None)
+        context = repeat(context, self.config.candidates)
+        return self._decide(observation, context, self.actor.draw(context, generator))
+
+    def noise_shape(self, choices: int) -> tuple[int, int]:
+        """That of a chain, its start and its steps, for each candidate."""
+        return self.config.candidates * (self.config.diffusion.steps + 1), self.spaces.continuous + choices
+
+    @torch.no_grad()
+    def decide(self, observation: Observation, noise: Tensor | None) -> HybridAction:
+        """See `Agent`."""
+        context = self.actor.average.encode(observation)
+        if noise is None:
+            return self._decide(observation, context, None)
+        chain = ChainNoise.of_rows(noise, self.config.diffusion.steps)
+        return self._decide(observation, repeat(context, self.config.candidates), chain)
+
+    def _decide(self, observation: Observation, context: Context, noise: ChainNoise | None) -> HybridAction:
+        """The best of a row's candidates, whose encodings stand one after another in `context`; 1 without noise."""
+        return self.best(observation, self.actor.decide(context, noise), 1 if noise is None else self.config.candidates)
+
+    def best(self, observation: Observation, drawn: HybridAction, count: int) -> HybridAction:
+        """Of each row's `count` drawn actions, one after another, that of largest min Q; its choice as configured."""
+        if count == 1 and not self.config.greedy_choice:
+            return drawn
         q, choice = self._best(self.critic, repeat(self.critic.encode(observation), count), drawn)
-        rows = len(q) // count
+        if count == 1:
+            return HybridAction(drawn.continuous, choice)
+        rows = q.shape[0] // count
         best = q.view(rows, count).argmax(dim=1) + count * torch.arange(rows, device=q.device)
         return HybridAction(drawn.continuous[best], choice[best])
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from uavrl.actions import HybridAction
 from uavrl.agents.base import Agent, AgentConfig, Batch, Metrics, adam, minimise
-from uavrl.agents.gaussian_actor import gaussian_action, log_likelihood
+from uavrl.agents.gaussian_actor import gaussian_action, gaussian_decision, log_likelihood
 from uavrl.networks import Observation, Spaces, make_choice_actor
 
 
@@ -53,3 +53,11 @@ class GaussianBehaviourCloning(Agent):
     def act(self, observation: Observation, *, generator: torch.Generator, deterministic: bool = False) -> HybridAction:
         """A sample of pi, or its mode."""
         return gaussian_action(self.actor, observation, generator, deterministic)
+
+    def noise_shape(self, choices: int) -> tuple[int, int]:
+        """A number for each entry of w and for each choice."""
+        return 1, self.spaces.continuous + choices
+
+    def decide(self, observation: Observation, noise: Tensor | None) -> HybridAction:
+        """See `Agent`."""
+        return gaussian_decision(self.actor, observation, noise)

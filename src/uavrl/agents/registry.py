@@ -15,11 +15,12 @@ from uavrl.agents.diffusion_actor import DiffusionConfig
 from uavrl.agents.diffusion_sac import DiffusionSac, DiffusionSacConfig
 from uavrl.agents.gaussian_bc import GaussianBcConfig, GaussianBehaviourCloning
 from uavrl.agents.iql import Iql, IqlConfig
+from uavrl.agents.one_step import OneStep, OneStepConfig
 from uavrl.agents.sac import Sac, SacConfig
 from uavrl.errors import ConfigError
 from uavrl.networks import NetworkConfig, Spaces
 
-Offline = DiffusionSacConfig | CqlConfig | IqlConfig | BcqConfig | BcConfig | GaussianBcConfig
+Offline = DiffusionSacConfig | CqlConfig | IqlConfig | BcqConfig | BcConfig | GaussianBcConfig | OneStepConfig
 OfflineConfig = Annotated[Offline, Field(discriminator="name")]
 AnyConfig = Annotated[Offline | SacConfig, Field(discriminator="name")]
 
@@ -30,6 +31,7 @@ AGENTS: dict[type[AgentConfig], Callable[[Spaces, Any], Agent]] = {
     BcqConfig: Bcq,
     BcConfig: BehaviourCloning,
     GaussianBcConfig: GaussianBehaviourCloning,
+    OneStepConfig: OneStep,
     SacConfig: Sac,
 }
 

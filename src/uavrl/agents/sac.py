@@ -32,6 +32,7 @@ from uavrl.agents.base import (
     minimise,
     move_towards,
 )
+from uavrl.agents.gaussian_actor import drawn_choice
 from uavrl.networks import Actor, Critic, Observation, Spaces, make_actor, make_critic
 from uavrl.networks.interfaces import ActorOutput
 
@@ -123,12 +124,23 @@ def soft_action(
     actor: Actor, observation: Observation, generator: torch.Generator, deterministic: bool
 ) -> HybridAction:
     """A sample of pi, or its mode."""
-    output = actor(observation)
     if deterministic:
-        return HybridAction(torch.tanh(output.mean), output.logits.argmax(dim=-1))
+        return soft_decision(actor, observation, None)
+    output = actor(observation)
     noise = torch.randn(output.mean.shape, generator=generator, device=generator.device)
     choice = torch.multinomial(output.logits.softmax(dim=-1), 1, generator=generator).squeeze(-1)
     return HybridAction(SquashedSample(output, noise).continuous, choice)
+
+
+@torch.no_grad()
+def soft_decision(actor: Actor, observation: Observation, noise: Tensor | None) -> HybridAction:
+    """The same with noise (B, 1, C + D) given, that of w and that of d; without: the mode."""
+    output = actor(observation)
+    if noise is None:
+        return HybridAction(torch.tanh(output.mean), output.logits.argmax(dim=-1))
+    continuous = output.mean.shape[-1]
+    sample = SquashedSample(output, noise[:, 0, :continuous])
+    return HybridAction(sample.continuous, drawn_choice(output.logits, noise[:, 0, continuous:]))
 
 
 class Sac(Agent):
@@ -191,3 +203,11 @@ class Sac(Agent):
     def act(self, observation: Observation, *, generator: torch.Generator, deterministic: bool = False) -> HybridAction:
         """A sample of pi, or its mode."""
         return soft_action(self.actor, observation, generator, deterministic)
+
+    def noise_shape(self, choices: int) -> tuple[int, int]:
+        """A number for each entry of w and for each choice."""
+        return 1, self.spaces.continuous + choices
+
+    def decide(self, observation: Observation, noise: Tensor | None) -> HybridAction:
+        """See `Agent`."""
+        return soft_decision(self.actor, observation, noise)

@@ -34,12 +34,17 @@ COMMANDS: dict[str, Command] = {
     "data convert": Command("uavrl.cli.data:DataConvert", "write logged flights in another form"),
     "collect": Command("uavrl.cli.collect:Collect", "log the flights of an agent that learns online"),
     "train": Command("uavrl.cli.train:Train", "learn a policy from logged flights alone"),
+    "distill": Command("uavrl.cli.distill:Distill", "teach a policy of one pass what a Diffusion-SAC decides"),
     "evaluate": Command("uavrl.cli.evaluate:Evaluate", "fly policies on equal layouts, starts and fading"),
+    "export": Command("uavrl.cli.export:Export", "write a policy as one file that flies without torch"),
     "ablate": Command("uavrl.cli.ablate:Ablate", "change one setting of Diffusion-SAC at a time and measure"),
     "bench simulate": Command(
         "uavrl.cli.bench:BenchSimulate", "measure environment steps a second, beside their floors"
     ),
     "bench train": Command("uavrl.cli.bench:BenchTrain", "measure updates a second, beside what the products allow"),
+    "bench decide": Command(
+        "uavrl.cli.bench:BenchDecide", "measure decisions of exported policies, beside their floors"
+    ),
     "demo": Command("uavrl.cli.demo:Demo", "learn a small policy, judge it, and show it"),
     "watch": Command("uavrl.cli.watch:Watch", "make a web page of one flight of a policy"),
 }

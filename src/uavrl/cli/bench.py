@@ -1,9 +1,10 @@
-"""`uavrl bench simulate|train`."""
+"""`uavrl bench simulate|train|decide`."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -98,4 +99,37 @@ class BenchTrain:
             _line(f"preset {name}, updates", found, f"{name}_updates", f"its products allow ({flop:.3g} GFLOP) in f32")
             if f"{name}_updates_bf16_floor_per_s" in found:
                 print(f"    in bf16 they allow {found[f'{name}_updates_bf16_floor_per_s']:,.4g}/s")
+        _end(found, self.seconds, self.json)
+
+
+@dataclass(frozen=True)
+class BenchDecide:
+    """Measure decisions of exported Diffusion-SAC policies, end to end, one aircraft and one thread, and in a batch."""
+
+    json: Path | None = None
+    """file for the figures, machine and versions included"""
+    seconds: float = 5.0
+    """how long each time and rate is measured for, after a warm-up"""
+
+    def run(self) -> None:
+        _check(self.seconds, self.json)
+        missing = [name for name in ("onnx", "onnxscript", "onnxruntime") if find_spec(name) is None]
+        if missing:
+            raise ConfigError(f"bench decide needs {', '.join(missing)}, install: pip install 'uavrl[export,deploy]'")
+        import torch
+
+        from uavrl.benchmarks import decide
+
+        torch.set_num_threads(1)
+        found: dict[str, Any] = {}
+        for name, case in decide.CASES.items():
+            found |= decide.measure(name, self.seconds)
+            print(
+                f"preset {case.preset}, {case.steps} steps: {found[f'{name}_ms']:.3g} ms in the median, "
+                f"{found[f'{name}_p99_ms']:.3g} ms in the 99th percentile; its products take "
+                f"{found[f'{name}_floor_ms']:.3g} ms"
+            )
+            print(
+                f"    {decide.AIRCRAFT:,} aircraft at once: {found[f'{name}_batch_decisions_per_s']:,.4g} decisions/s"
+            )
         _end(found, self.seconds, self.json)

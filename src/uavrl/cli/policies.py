@@ -6,6 +6,7 @@ import importlib
 import inspect
 import sys
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from uavrl.scenario import Scenario
 
 
 def resolve(spec: str, scenario: Scenario) -> Policy:
-    """A heuristic by name, a trained policy by its checkpoint's directory, or your own as `module:Class`.
+    """A heuristic by name, a checkpoint by its directory, an exported policy by its file, your own as `module:Class`.
 
     Raises:
         ConfigError: there is no such policy, or `module:Class` cannot be imported or is no policy.
@@ -28,10 +29,17 @@ def resolve(spec: str, scenario: Scenario) -> Policy:
         from uavrl.training.policy import load_policy  # here: torch is slow to import
 
         return load_policy(Path(spec), scenario)
+    if spec.endswith(".onnx"):
+        if find_spec("onnxruntime") is None:
+            raise ConfigError(f"policy '{spec}' needs onnxruntime, install it: pip install 'uavrl[deploy]'")
+        from uavrl.deployment.flight import ExportedPolicy  # here: onnxruntime is an extra
+
+        return ExportedPolicy(Path(spec), scenario)
     if ":" in spec:
         return _import(spec, scenario)
     raise ConfigError(
-        f"policy '{spec}' does not exist, allowed: {', '.join(POLICIES)}, the directory of a checkpoint, module:Class"
+        f"policy '{spec}' does not exist, allowed: {', '.join(POLICIES)}, the directory of a checkpoint, "
+        "an .onnx file, module:Class"
     )
 
 

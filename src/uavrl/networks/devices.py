@@ -201,7 +201,7 @@ class SetDenoiser(Denoiser):
         """See `Denoiser`."""
         token, globals_, valid = context
         own, rest = vector[:, self.continuous + 1 :, None], vector[:, : self.continuous + 1]
-        whole = torch.cat([rest, step.expand(len(rest), -1)], dim=-1)
+        whole = torch.cat([rest, step.expand(rest.shape[0], -1)], dim=-1)
         hidden, whole = self.trunk(token, globals_, valid, own, whole)
         return torch.cat([self.global_out(whole), self.device_out(hidden).squeeze(-1)], dim=-1)
 

@@ -17,6 +17,8 @@ Context = tuple[Tensor, ...]  # an encoded observation, each entry batch first
 
 def repeat(context: Context, times: int) -> Context:
     """Each row `times` times in a row, (B, ...) -> (B x times, ...)."""
+    if times == 1:
+        return context
     return tuple(entry.repeat_interleave(times, dim=0) for entry in context)
 
 

@@ -159,7 +159,7 @@ class _MlpQ(nn.Module):
             q: Tensor = self.rest(first)
         else:
             rows = (first[:, None] + self.choice.weight.T).flatten(0, 1)
-            q = self.rest(rows).view(len(first), -1)
+            q = self.rest(rows).view(first.shape[0], -1)
         return q
 
     def value(self, context: Tensor, continuous: Tensor, choice: Tensor) -> Tensor:

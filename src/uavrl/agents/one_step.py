@@ -1,0 +1,129 @@
+r"""One-step policy: a student that answers at once what a trained Diffusion-SAC's chain arrives at.
+
+After flow Q-learning (Park, Li, Levine 2025, arXiv:2502.02538). The teacher's DDIM without noise is a map from x_M to
+the vector [w, z] before its argmax; the student \mu_\omega(s, x_M) learns that map in one pass, with the teacher's Q:
+    L = E|\mu_\omega(s, x_M) - DDIM_\theta(s, x_M)|^2 + q_weight L_g(\mu_\omega(s, x_M))
+An ancestral chain is no map of x_M: a squared error to it would average its modes.
+"""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from typing import Literal, Self
+
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor, nn
+
+from uavrl.actions import HybridAction, decode
+from uavrl.agents.base import Agent, AgentConfig, Batch, Metrics, adam, minimise, move_towards
+from uavrl.agents.diffusion_actor import block_mean
+from uavrl.agents.diffusion_sac import DiffusionSac, DiffusionSacConfig
+from uavrl.networks import Denoiser, Observation, Spaces, make_denoiser, repeat
+from uavrl.networks.interfaces import Context
+
+
+class OneStepConfig(AgentConfig):
+    """Settings of the student; `network` and `reward` are its teacher's."""
+
+    name: Literal["one_step"] = "one_step"
+    teacher: DiffusionSacConfig = DiffusionSacConfig()
+    learning_rate: float = Field(1e-3, gt=0, description="of Adam")
+    q_weight: float = Field(0.0, ge=0, description="of L_g beside the squared error; 0 skips it")
+    still: float = Field(
+        0.75, ge=0, le=1, description="share of a batch that starts from x_M = 0, as a deterministic decision does"
+    )
+    displacement_weight: float = Field(3.0, gt=0, description="weight of a continuous entry in the squared error")
+    student_average: float = Field(0.98, ge=0, lt=1, description="decay of the student that acts; 0: no average")
+    candidates: int = Field(1, ge=1, description="actions drawn at a decision; the one of largest min Q is taken")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.network != self.teacher.network:
+            raise ValueError("network must be that of the teacher")
+        return self
+
+
+class OneStep(Agent):
+    """A student of one pass beside its teacher, whose critic chooses the device for the student's w.
+
+    Its teacher knows nothing until `learn_from`.
+    """
+
+    config: OneStepConfig
+    acts_best_deterministically = True
+
+    def __init__(self, spaces: Spaces, config: OneStepConfig) -> None:
+        self.spaces, self.config = spaces, config
+        self.teacher = DiffusionSac(spaces, config.teacher)
+        self.student: Denoiser = make_denoiser(spaces, config.network)
+        self.average = deepcopy(self.student).requires_grad_(False)
+        self.networks = nn.ModuleDict(
+            {
+                "teacher": self.teacher.actor.average,
+                "critic": self.teacher.critic,
+                "student": self.student,
+                "average": self.average,
+            }
+        )
+        self.optimisers = {"student": adam(self.student.parameters(), config)}
+
+    def learn_from(self, teacher: DiffusionSac) -> None:
+        """Take over a trained teacher's target actor and critic; the student begins with that actor's weights."""
+        learned = teacher.actor.average.state_dict()
+        for network in (self.teacher.actor.average, self.student, self.average):
+            network.load_state_dict(learned)
+        self.teacher.critic.load_state_dict(teacher.critic.state_dict())
+
+    def map(self, student: Denoiser, context: Context, start: Tensor) -> Tensor:
+        """The student's vector (B, C + D) from x_M (B, C + D), in one pass."""
+        last = torch.full((1,), self.config.teacher.diffusion.steps, device=start.device)
+        return student.predict(context, start, student.steps(last))
+
+    def student_loss(self, batch: Batch, start: Tensor) -> tuple[Tensor, Metrics]:
+        """The loss above; start (B, C + D) is x_M of student and teacher."""
+        config, teacher = self.config, self.teacher.actor
+        with torch.no_grad():
+            wanted = teacher.map(teacher.average, teacher.average.encode(batch.observation), start)
+        answer = self.map(self.student, self.student.encode(batch.observation), start)
+        distance = block_mean((answer - wanted).square(), self.spaces.continuous, config.displacement_weight)
+        loss, metrics = distance, {"distance": distance.detach()}
+        if config.q_weight > 0:
+            guidance, more = self.teacher.guidance_loss(batch.observation, answer)
+            loss = loss + config.q_weight * guidance
+            metrics |= more
+        return loss, metrics | {"actor_loss": loss.detach()}
+
+    def update(self, batch: Batch, generator: torch.Generator) -> Metrics:
+        """One step of the student, and of its average."""
+        count, size = len(batch.reward), self.spaces.continuous + self.spaces.choices
+        start = torch.randn((count, size), generator=generator, device=generator.device)
+        moves = torch.rand((count, 1), generator=generator, device=generator.device) >= self.config.still
+        loss, metrics = self.student_loss(batch, start * moves)
+        clip = self.config.gradient_clip
+        metrics["actor_gradient"] = minimise(loss, self.student, self.optimisers["student"], clip)
+        move_towards(self.average, self.student, 1.0 - self.config.student_average)
+        return metrics
+
+    def noise_shape(self, choices: int) -> tuple[int, int]:
+        """x_M of each candidate."""
+        return self.config.candidates, self.spaces.continuous + choices
+
+    @torch.no_grad()
+    def decide(self, observation: Observation, noise: Tensor | None) -> HybridAction:
+        """See `Agent`."""
+        context, count = self.average.encode(observation), 1 if noise is None else self.config.candidates
+        shape = (count * context[0].shape[0], self.average.vector_size(context))
+        start = torch.zeros(shape, device=context[0].device) if noise is None else noise.reshape(shape)
+        context = repeat(context, count)
+        vector = self.average.possible(context, self.map(self.average, context, start))
+        return self.teacher.best(observation, decode(vector, self.spaces.continuous), count)
+
+    @torch.no_grad()
+    def act(self, observation: Observation, *, generator: torch.Generator, deterministic: bool = False) -> HybridAction:
+        """The student's answer to noise, the best of `candidates` by min Q; deterministic: to x_M = 0."""
+        if deterministic:
+            return self.decide(observation, None)
+        context = self.average.encode(observation)
+        shape = (len(context[0]), self.config.candidates, self.average.vector_size(context))
+        return self.decide(observation, torch.randn(shape, generator=generator, device=generator.device))

@@ -1,0 +1,100 @@
+"""Time of a decision of an exported policy, end to end, beside its network's matrix products alone."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from uavrl.agents.diffusion_sac import DiffusionSacConfig
+from uavrl.agents.registry import make_agent, preset
+from uavrl.benchmarks.timing import rate
+from uavrl.benchmarks.train import Products
+from uavrl.datasets import load_builtin
+from uavrl.deployment.export import export
+from uavrl.deployment.runtime import Policy
+from uavrl.networks import fit_normalisers
+from uavrl.scenario import Scenario, load_scenario
+from uavrl.training.batches import OBSERVATION_OF, spaces_of, to_tensors
+
+AIRCRAFT = 10_000  # of a ground station's batch
+WARM_UP = 50
+
+
+class Case(NamedTuple):
+    """A preset of Diffusion-SAC, its chain shortened or not."""
+
+    preset: str
+    steps: int
+
+
+# The paper's perceptron, 3 x 256, decides by its chain alone; the set network of the default also asks its critic.
+CASES = {
+    "five_step": Case("paper", 5),
+    "fifty_step": Case("paper", 50),
+    "default": Case("default", 5),
+}
+
+
+def settings(case: Case) -> DiffusionSacConfig:
+    """The preset with the case's number of steps."""
+    config = preset("diffusion_sac", case.preset)
+    chain = config.diffusion.model_copy(update={"steps": case.steps})  # type: ignore[union-attr]  # of Diffusion-SAC
+    return DiffusionSacConfig.model_validate({**config.model_dump(), "diffusion": chain.model_dump()})
+
+
+def times_s(call: Callable[[int], Any], seconds: float) -> NDArray[np.float64]:
+    """Durations of call(0), call(1), ... for about `seconds`, after a warm-up."""
+    for index in range(WARM_UP):
+        call(index)
+    found: list[float] = []
+    end = time.perf_counter() + seconds
+    while not found or time.perf_counter() < end:
+        began = time.perf_counter()
+        call(len(found))
+        found.append(time.perf_counter() - began)
+    return np.array(found)
+
+
+def measure(name: str, seconds: float, scenario: Scenario | None = None) -> dict[str, float]:
+    """Milliseconds of `Policy.decide` for one aircraft, of its floor, and decisions a second for `AIRCRAFT` at once.
+
+    The floor is the products of one decision with each of the network's matrices, one after another. Weights are not
+    trained, which changes no time.
+    """
+    scenario = load_scenario("released") if scenario is None else scenario
+    config = settings(CASES[name])
+    kind = OBSERVATION_OF[config.network.kind]
+    logged, _ = load_builtin("layouts").observations(kind, scenario)
+    state = torch.random.get_rng_state()
+    agent = make_agent(spaces_of(scenario, config.network.kind), config)
+    torch.random.set_rng_state(state)
+    seen = to_tensors(logged)
+    fit_normalisers(agent.networks, seen)
+    with tempfile.TemporaryDirectory() as folder:
+        export(agent, scenario, Path(folder) / "policy.onnx")
+        policy = Policy(Path(folder) / "policy.onnx")
+
+    def rows(index: slice | int) -> Any:
+        return {key: value[index] for key, value in logged.items()} if isinstance(logged, dict) else logged[index]
+
+    count = len(next(iter(logged.values())) if isinstance(logged, dict) else logged)
+    singles = [rows(index) for index in range(min(count, 1000))]
+    taken = times_s(lambda index: policy.decide(singles[index % len(singles)]), seconds)
+    products = Products()
+    with products, torch.no_grad():
+        agent.decide(to_tensors(rows(slice(0, 1))), None)
+    many = rows(slice(0, AIRCRAFT))
+    batch = rate(lambda: policy.decide(many), work=min(count, AIRCRAFT), seconds=seconds, repeats=3)
+    return {
+        f"{name}_ms": 1e3 * float(np.median(taken)),
+        f"{name}_p99_ms": 1e3 * float(np.percentile(taken, 99)),
+        f"{name}_floor_ms": 1e3 * products.seconds(torch.float32, min(0.1, seconds)),
+        **batch.named(f"{name}_batch_decisions"),
+    }

@@ -1,0 +1,82 @@
+"""`uavrl distill`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from uavrl.cli.settings import output_directory, pydantic_config, with_settings
+from uavrl.errors import ConfigError
+
+Many = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+
+UPDATES = 3_000
+
+
+@dataclass(frozen=True)
+class Distill:
+    """Teach a policy of one network pass what a trained Diffusion-SAC's whole chain decides."""
+
+    checkpoint: tyro.conf.Positional[Path]
+    """directory of a run of diffusion_sac, or of its checkpoint"""
+    out: Path
+    """directory of the student's run: checkpoint and metrics.jsonl"""
+    data: str = "layouts"
+    """flights to practise on, as the teacher's: layouts or fixed (built in), a file, or the id of a Minari dataset"""
+    updates: int = UPDATES
+    """gradient steps, some 25 ms each on one core"""
+    seed: int = 0
+    """of data order and noise"""
+    set: Many = ()
+    """a setting as name=value, such as q_weight=0.01; repeat it for more"""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """where to compute"""
+    evaluate_every: int = 0
+    """updates between trial flights on 20 layouts of their own; 0: none"""
+
+    def run(self) -> None:
+        from uavrl.agents.diffusion_sac import DiffusionSac
+        from uavrl.agents.one_step import OneStep, OneStepConfig
+        from uavrl.cli.train import LOG_EVERY, trial_flights
+        from uavrl.datasets import load_source
+        from uavrl.training.checkpoint import checkpoint_in, load_checkpoint, recover
+        from uavrl.training.log import progress
+        from uavrl.training.offline import OfflineLearner, TrainConfig
+        from uavrl.training.policy import load_agent
+
+        place = checkpoint_in(self.checkpoint)
+        checkpoint = load_checkpoint(place)
+        teacher = load_agent(checkpoint, place)
+        if not isinstance(teacher, DiffusionSac):
+            agent = checkpoint.document["agent"]
+            raise ConfigError(f"'{self.checkpoint}' is of agent '{agent}', allowed: diffusion_sac")
+        transitions, scenario = load_source(self.data)
+        shared = {name: getattr(teacher.config, name) for name in ("network", "reward", "batch_size")}
+        config = pydantic_config(
+            TrainConfig,
+            scenario=scenario,
+            agent=with_settings(OneStepConfig(teacher=teacher.config, **shared), self.set),
+            updates=self.updates,
+            seed=self.seed,
+            log_every=min(LOG_EVERY, max(1, self.updates // 50)),
+            evaluate_every=self.evaluate_every,
+        )
+        output_directory(self.out)
+        if recover(self.out / "checkpoint") is not None:
+            raise ConfigError(f"--out '{self.out}' holds a run already; give another directory")
+        learner = OfflineLearner(config, transitions, self.device)
+        if learner.agent.spaces != teacher.spaces:
+            raise ConfigError(
+                f"--data {self.data} has devices = {scenario.traffic.devices}, "
+                f"allowed: {teacher.spaces.choices - 1}, as the teacher's"
+            )
+        assert isinstance(learner.agent, OneStep)  # noqa: S101  # for the type checker
+        learner.agent.learn_from(teacher)
+        trial = trial_flights(transitions, scenario) if self.evaluate_every else None
+        with progress("distill", config.updates, "update") as report:
+            learner.run(self.out, report, trial)
+        print(f"{learner.updates:,} updates; policy of one step in {self.out}")
+        print(f"next: uavrl evaluate --policy {self.checkpoint} --policy {self.out} --deterministic")

@@ -1,0 +1,78 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.datasets.flights import fly, small_scenario
+from uavrl.agents.one_step import OneStep
+from uavrl.cli import main
+from uavrl.datasets import save_flat
+from uavrl.training.checkpoint import load_checkpoint
+from uavrl.training.policy import load_policy
+
+SMALL = [word for setting in ("network.width=8", "batch_size=8") for word in ("--set", setting)]
+CHAIN = ["--set", "diffusion.steps=2"]
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log of 60 rows, and a teacher and a BC trained on it."""
+    folder = tmp_path_factory.mktemp("runs")
+    for name, devices in (("log", 4), ("wide", 5)):
+        scenario = small_scenario().replace(devices=devices)
+        save_flat(folder / f"{name}.parquet", fly(scenario, steps=20), scenario)
+    for agent in ("diffusion_sac", "bc"):
+        words = ["train", agent, "--out", str(folder / agent), "--data", str(folder / "log.parquet"), "--updates", "3"]
+        assert main([*words, *SMALL, *CHAIN]) == 0
+    return folder
+
+
+def test_a_teacher_gets_a_student(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "student"
+    words = ["--data", str(runs / "log.parquet"), "--updates", "20", "--set", "q_weight=0.01", "--evaluate-every", "10"]
+    assert main(["distill", str(runs / "diffusion_sac"), "--out", str(out), *words]) == 0
+    assert f"20 updates; policy of one step in {out}" in capsys.readouterr().out
+    teacher, student = (load_policy(run, small_scenario()).agent for run in (runs / "diffusion_sac", out))
+    assert isinstance(student, OneStep)
+    kept, learned = teacher.networks.state_dict(), student.networks.state_dict()
+    for name, value in learned.items():
+        part, _, rest = name.partition(".")
+        if part in ("teacher", "critic"):
+            of = f"actor.average.{rest}" if part == "teacher" else name
+            assert (value == kept[of]).all(), name
+    rows = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    assert {"distance", "guided_q", "support_distance"} < set(rows[0])
+    assert sum("return" in row for row in rows) == 2
+    assert load_checkpoint(out / "checkpoint").document["config"]["q_weight"] == 0.01
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["BC"], "is of agent 'bc', allowed: diffusion_sac"),
+        (["nowhere"], "nowhere"),
+        (["TEACHER", "--data", "WIDE"], "has devices = 5, allowed: 4, as the teacher's"),
+        (["TEACHER", "--set", "q_weight=-1"], "'q_weight' = -1"),
+        (["TEACHER", "--set", "teacher.network.width=9"], "network must be that of the teacher"),
+        (["TEACHER", "--updates", "0"], "'updates' = 0"),
+    ],
+)
+def test_mistakes_get_one_line(
+    runs: Path, tmp_path: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    places = {"BC": "bc", "TEACHER": "diffusion_sac", "WIDE": "wide.parquet"}
+    typed = [str(runs / places[word]) if word in places else word for word in words]
+    data = [] if "--data" in words else ["--data", str(runs / "log.parquet")]
+    capsys.readouterr()
+    assert main(["distill", *typed, *data, "--out", str(tmp_path / "out")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
+
+
+def test_a_run_that_is_there_is_left_alone(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--data", str(runs / "log.parquet"), "--out", str(runs / "bc")]
+    assert main(["distill", str(runs / "diffusion_sac"), *words]) == 2
+    assert "holds a run already" in capsys.readouterr().err
+    assert load_checkpoint(runs / "bc/checkpoint").document["agent"] == "bc"
