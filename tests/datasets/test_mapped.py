@@ -99,6 +99,18 @@ def test_parquet_is_read_in_parts_and_its_bad_cells_are_named(
         list(flat.read_parts(file, scenario))
 
 
+def test_of_parquet_one_row_group_is_held_at_a_time(scenario: Scenario, tmp_path: Path) -> None:
+    file = tmp_path / "log.parquet"
+    save_flat(file, fly(scenario, environments=1000, steps=40), scenario)
+    pq.write_table(pq.read_table(file), file, row_group_size=2_000)
+    before, held = pa.total_allocated_bytes(), []
+    for part in flat.read_parts(file, scenario):
+        held.append(pa.total_allocated_bytes() - before)
+        assert len(part) == 2_000
+    assert len(held) == 20
+    assert max(held) < 0.3 * file.stat().st_size
+
+
 def test_what_is_written_in_parts_needs_memory_for_parts(scenario: Scenario, tmp_path: Path) -> None:
     part = fly(scenario, environments=50, steps=40)  # 2,000 rows
     episodes, size = int(part.episode.max()) + 1, sum(values.nbytes for values in part.columns().values())

@@ -121,18 +121,21 @@ def load_flat(path: str | Path, scenario: Scenario) -> Transitions:
 
 
 def read_parts(path: str | Path, scenario: Scenario) -> Iterator[Transitions]:
-    """The rows of Parquet in turn, at most `PART_ROWS` in memory; not validated: that is left to who takes them.
+    """The rows of Parquet in turn, at most `PART_ROWS` a part; not validated: that is left to who takes them.
+
+    Memory is a part's and a row group's, as it is in the file.
 
     Raises:
         DatasetError: a file that cannot be read, a missing column, a wrong shape or type.
     """
     path = Path(path)
-    with _named_errors(path), pq.ParquetFile(path, page_checksum_verification=True, buffer_size=2**20) as file:
+    with _named_errors(path), pq.ParquetFile(path, page_checksum_verification=True) as file:
         names, first = [name for name in COLUMNS if name in file.schema_arrow.names], 0
-        for batch in file.iter_batches(PART_ROWS, columns=names):
-            columns = {name: _unnest(path, name, batch[name], 1, first) for name in names}
-            yield _transitions(path, columns, scenario, first)
-            first += len(batch)
+        for group in range(file.num_row_groups):  # one at a time: Arrow keeps what it has read of all it was asked for
+            for batch in file.iter_batches(PART_ROWS, row_groups=[group], columns=names):
+                columns = {name: _unnest(path, name, batch[name], 1, first) for name in names}
+                yield _transitions(path, columns, scenario, first)
+                first += len(batch)
 
 
 def _transitions(path: Path, columns: dict[str, NDArray[Any]], scenario: Scenario, first: int = 0) -> Transitions:
