@@ -80,7 +80,7 @@ def noise_of_act(made: Agent, name: str, rows: int, seed: int) -> Tensor:
         chains = rows * shape[1] // (steps + 1)
         chain = ChainNoise.draw(chains, shape[2], steps, generator)
         return torch.cat([chain.start[None], chain.steps]).transpose(0, 1).reshape(shape)
-    if name == "bcq":
+    if name in ("bcq", "one_step"):
         return torch.randn(shape, generator=generator)
     w = torch.randn((rows, 2), generator=generator) if name in ("sac", "cql") else None
     clock = torch.empty((rows, choices)).exponential_(generator=generator).double()  # as torch.multinomial
