@@ -42,7 +42,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def requirements(project: dict[str, Any]) -> list[Requirement]:
     extras = project["optional-dependencies"].values()
-    return [Requirement(text) for text in [*project["dependencies"], *(text for extra in extras for text in extra)]]
+    every = [Requirement(text) for text in [*project["dependencies"], *(text for extra in extras for text in extra)]]
+    return [one for one in every if one.name != "uavrl"]  # an extra that takes up others
 
 
 def test_the_installed_version_is_the_source_s() -> None:

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from uavrl.agents.diffusion_sac import DiffusionSacConfig
+from uavrl.agents.one_step import OneStepConfig
 from uavrl.agents.registry import make_agent, preset
 from uavrl.benchmarks.timing import rate
 from uavrl.benchmarks.train import Products
@@ -28,7 +29,7 @@ WARM_UP = 50
 
 
 class Case(NamedTuple):
-    """A preset of Diffusion-SAC, its chain shortened or not."""
+    """A preset of Diffusion-SAC with a chain of so many steps, or its one-step student (1)."""
 
     preset: str
     steps: int
@@ -36,15 +37,19 @@ class Case(NamedTuple):
 
 # The paper's perceptron, 3 x 256, decides by its chain alone; the set network of the default also asks its critic.
 CASES = {
+    "one_step": Case("paper", 1),
     "five_step": Case("paper", 5),
     "fifty_step": Case("paper", 50),
+    "default_one_step": Case("default", 1),
     "default": Case("default", 5),
 }
 
 
-def settings(case: Case) -> DiffusionSacConfig:
-    """The preset with the case's number of steps."""
+def settings(case: Case) -> DiffusionSacConfig | OneStepConfig:
+    """The preset with the case's number of steps, or a student of it."""
     config = preset("diffusion_sac", case.preset)
+    if case.steps == 1:
+        return OneStepConfig.model_validate({"teacher": config.model_dump(), "network": config.network})
     chain = config.diffusion.model_copy(update={"steps": case.steps})  # type: ignore[union-attr]  # of Diffusion-SAC
     return DiffusionSacConfig.model_validate({**config.model_dump(), "diffusion": chain.model_dump()})
 
