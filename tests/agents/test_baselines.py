@@ -285,7 +285,8 @@ def test_losses_of_iql(kind: Kind, beta: float, limit: float) -> None:
     data = batch(kind, rows)
     with torch.no_grad():  # as many advantages above 0 as below
         middle = (made.target_q(data) - made.state_value(data.observation)).median()
-        made.value.rest.out.bias.add_(middle)  # type: ignore[operator,union-attr]  # a tensor
+        last = made.value.rest.out if kind == "mlp" else made.value.out  # type: ignore[union-attr]  # a module
+        last.bias.add_(middle)  # type: ignore[operator,union-attr]  # a tensor
     v_loss, q_loss, actor_loss, capped = 0.0, 0.0, 0.0, 0
     for i in range(rows):
         seen, w, d = row(data.observation, i), data.action.continuous[i], int(data.action.choice[i])

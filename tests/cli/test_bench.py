@@ -63,7 +63,6 @@ def test_decisions_are_measured_beside_their_products(
     found = json.loads(file.read_text())
     assert 0 < found["five_step_floor_ms"] < found["five_step_ms"] <= found["five_step_p99_ms"]
     assert found["five_step_batch_decisions_per_s"] > 1e3 / found["five_step_ms"]  # or a batch would be no use
-    assert 0 < found["one_step_ms"] < found["five_step_ms"]
     assert f"{found['five_step_ms']:.3g} ms in the median" in capsys.readouterr().out
 
 
