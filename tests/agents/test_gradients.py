@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from tests.agents.problems import KINDS, Kind, agent, batch, copies, diffusion_sac, disturb, equal, noise
+from tests.agents.problems import DEVICES, KINDS, Kind, agent, batch, copies, diffusion_sac, disturb, equal, noise
 from uavrl.agents import diffusion_sac as module
 from uavrl.agents.base import minimise
 from uavrl.agents.bc import BehaviourCloning
@@ -390,3 +390,19 @@ def test_sac_losses_train_their_own_networks(kind: Kind) -> None:
         (slope,) = torch.autograd.grad(made.temperature_loss(entropy, 5), made.log_temperature)
         assert slope[less] < 0 < slope[more]
     assert metrics["entropy"].shape == (2,)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", ["diffusion_sac", "sac"])
+def test_the_actors_loss_holds_no_graph_of_the_critics_weights(name: str, kind: Kind) -> None:
+    """Their gradients would cost as much again as the actor's, and nobody reads them."""
+    made = agent(name, kind)
+    data = batch(kind, ROWS)
+    if isinstance(made, DiffusionSac):
+        loss, _ = made.guidance_loss(data.observation, noise(1, ROWS, DEVICES + 3).requires_grad_())
+    else:
+        assert isinstance(made, Sac)
+        loss, _ = made.actor_loss(data, noise(1, ROWS, 2))
+    assert loss.requires_grad
+    assert all(value is None for value in gradients(loss, made.critic).values())
+    assert all(parameter.requires_grad for parameter in made.critic.parameters())
