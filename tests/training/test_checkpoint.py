@@ -143,7 +143,7 @@ def kill(patch: pytest.MonkeyPatch, operation: int, share: float) -> None:
     write_text = Path.write_text
     patch.setattr(shutil, "rmtree", instead(shutil.rmtree, some))
     patch.setattr(module, "save_file", instead(save_file, cut))
-    patch.setattr(module, "_sync", instead(lambda path: None, whole_or_not))
+    patch.setattr(module, "sync", instead(lambda path: None, whole_or_not))
     patch.setattr(Path, "write_text", instead(write_text, cut))
     patch.setattr(Path, "mkdir", instead(Path.mkdir, whole_or_not))
     patch.setattr(Path, "rename", instead(Path.rename, whole_or_not))

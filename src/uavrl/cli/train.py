@@ -56,7 +56,7 @@ class Train:
     device: Literal["cpu", "cuda"] = "cpu"
     """where to compute"""
     compile: Literal["none", "step", "graphs"] = "none"
-    """compile the networks' passes, half a minute once: pays from some 5,000 updates; graphs: in CUDA graphs, too"""
+    """compile the networks' passes, which takes half a minute once; graphs: in CUDA graphs, too"""
     evaluate_every: int = 0
     """updates between trial flights on 20 layouts of their own; 0: none"""
     resume: bool = False

@@ -14,7 +14,6 @@ All is validated while it is written, under a temporary name, then renamed. Open
 from __future__ import annotations
 
 import mmap
-import os
 import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -26,6 +25,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from uavrl import __version__
+from uavrl.datasets.files import sync
 from uavrl.datasets.transitions import COLUMNS, Transitions
 from uavrl.datasets.validation import validated
 from uavrl.errors import DatasetError
@@ -113,9 +113,9 @@ def save_mapped(
         manifest = _Manifest(rows=count, devices=devices, sha256=digest)
         (temporary / MANIFEST).write_text(manifest.model_dump_json(indent=1) + "\n", encoding="utf-8")
         for entry in (*temporary.iterdir(), temporary):
-            _sync(entry)
+            sync(entry)
         temporary.rename(path)
-        _sync(path.parent)
+        sync(path.parent)
     except OSError as error:
         raise DatasetError(f"{path}: cannot be written: {error.strerror or error}") from None
     finally:
@@ -148,14 +148,6 @@ def _write(path: Path, parts: Iterable[Transitions], devices: int) -> int:
 def _write_header(file: BinaryIO, record: np.dtype[Any], count: int) -> None:
     header = {"descr": np.lib.format.dtype_to_descr(record), "fortran_order": False, "shape": (count,)}
     np.lib.format.write_array_header_1_0(file, header)
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def open_mapped(path: str | Path) -> MappedTransitions:

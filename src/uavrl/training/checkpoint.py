@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import platform
 import shutil
 from dataclasses import dataclass
@@ -33,6 +32,7 @@ from torch import Tensor
 
 from uavrl import __version__
 from uavrl.agents.base import Agent
+from uavrl.datasets.files import sync
 from uavrl.errors import CheckpointError
 
 MANIFEST = "checkpoint.json"
@@ -57,18 +57,18 @@ def save_checkpoint(directory: Path, document: dict[str, Any], tensors: dict[str
     for name, entries in tensors.items():
         path = temporary / f"{name}.safetensors"
         save_file({key: value.detach().contiguous().cpu().clone() for key, value in entries.items()}, path)
-        _sync(path)
+        sync(path)
         files[path.name] = {"bytes": path.stat().st_size, "sha256": _sha256(path)}
     versions = {"uavrl": __version__, "python": platform.python_version(), "torch": torch.__version__}
     path = temporary / MANIFEST
     path.write_text(json.dumps({**document, "files": files, "versions": versions}, indent=1), encoding="utf-8")
-    _sync(path)
-    _sync(temporary)
+    sync(path)
+    sync(temporary)
     if directory.exists():
         shutil.rmtree(old, ignore_errors=True)  # left by a writer killed while deleting it
         directory.rename(old)
     temporary.rename(directory)
-    _sync(directory.parent)
+    sync(directory.parent)
     shutil.rmtree(old, ignore_errors=True)
 
 
@@ -174,14 +174,6 @@ def _temporary(directory: Path) -> Path:
 
 def _old(directory: Path) -> Path:
     return directory.with_name(f".{directory.name}.old")
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _sha256(path: Path) -> str:
