@@ -25,10 +25,10 @@ ROOMS = (
     "datasets",
     "evaluation",
     "training",
-    "experiments",
     "deployment",
     "viewer",
     "benchmarks",
+    "experiments",
     "cli",
     "__main__",
 )

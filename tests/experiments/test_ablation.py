@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -42,31 +43,31 @@ def test_a_nested_change_keeps_its_neighbours() -> None:
     assert not config.network.choice_heads
 
 
-def test_the_bandit_is_measured_with_each_number_of_candidates() -> None:
+def test_the_bandit_is_measured_with_each_number_of_candidates(tmp_path: Path) -> None:
     (run,) = runs("bandit", (0,), (BASE,))
-    scores = measure(small(run))
+    scores = measure(small(run), tmp_path)
     names = ("right_choice", "near_mode", "both")
     assert set(scores) == {*names, *(f"{name}@{count}" for name in names for count in CANDIDATES)}
     assert all(0 <= share <= 1 for share in scores.values())
 
 
-def test_flights_are_measured_by_either_action(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flights_are_measured_by_either_action(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(ablation, "CANDIDATES", (2,))
     monkeypatch.setattr(ablation, "load_scenario", lambda name: load_scenario(name, max_steps=5))
     (run,) = runs("fixed", (0,), (BASE,))
-    scores = measure(small(run.model_copy(update={"options": {**run.options, "episodes": 2}})))
+    scores = measure(small(run.model_copy(update={"options": {**run.options, "episodes": 2}})), tmp_path)
     assert set(scores) == {"return_deterministic", "return_sampled", "return_sampled@2"}
     assert all(-100 < value < 0 for value in scores.values())
     assert len(set(scores.values())) == 3
 
 
-def test_returns_are_filed_under_the_action_that_flew_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_returns_are_filed_under_the_action_that_flew_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def fly(policy: object, flights: object, *, deterministic: bool) -> SimpleNamespace:
         return SimpleNamespace(reward=np.full((3, 2), -1.0 if deterministic else -2.0), active=np.ones((3, 2)))
 
     monkeypatch.setattr(ablation, "fly", fly)
     (run,) = runs("fixed", (0,), ("no action noise",))
-    assert measure(small(run)) == {"return_deterministic": -3.0, "return_sampled": -6.0}
+    assert measure(small(run), tmp_path) == {"return_deterministic": -3.0, "return_sampled": -6.0}
 
 
 def test_the_table_has_a_line_a_variant_and_one_for_each_number_of_candidates() -> None:

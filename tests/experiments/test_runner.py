@@ -13,11 +13,11 @@ def wanted(count: int) -> list[Run]:
     return [Run(problem="p", variant=f"v{seed}", settings={"a": 1}, updates=2, seed=seed) for seed in range(count)]
 
 
-def scores(run: Run) -> dict[str, float]:
+def scores(run: Run, directory: Path) -> dict[str, float]:
     return {"score": 10.0 * run.seed}
 
 
-def refuses(run: Run) -> dict[str, float]:
+def refuses(run: Run, directory: Path) -> dict[str, float]:
     raise ValueError(f"computed again: {run.seed}")
 
 

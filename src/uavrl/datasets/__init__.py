@@ -3,6 +3,7 @@
 from uavrl.datasets.flat import load_flat, save_flat, stored_scenario
 from uavrl.datasets.mapped import MappedTransitions, save_mapped
 from uavrl.datasets.minari_io import read_minari, write_minari
+from uavrl.datasets.objective import relabelled
 from uavrl.datasets.replay import ReplayLog
 from uavrl.datasets.report import describe
 from uavrl.datasets.selection import Quality, select
@@ -24,6 +25,7 @@ __all__ = [
     "load_parts",
     "load_source",
     "read_minari",
+    "relabelled",
     "save_flat",
     "save_mapped",
     "select",

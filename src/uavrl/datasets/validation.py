@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uavrl.datasets.objective import costs
 from uavrl.datasets.transitions import COLUMNS, Transitions
 from uavrl.errors import DatasetError
-from uavrl.physics.energy import hover_power_w
-from uavrl.scenario import Scenario, hover_reference_j
-from uavrl.simulation.dynamics import age_term
+from uavrl.scenario import Scenario
 
 RELATIVE_TOLERANCE = 2e-5  # some hundred roundings of float32
 _ABSOLUTE = 1e-3  # metres, seconds, joules
@@ -141,10 +140,9 @@ def _ranges(check: _Check, t: Transitions, scenario: Scenario) -> None:
 
 
 def _reward(check: _Check, t: Transitions, scenario: Scenario) -> None:
-    age = age_term(scenario, *(a.astype(np.float64) for a in (t.age_s, t.next_age_s, t.duration_s)))
+    age, energy, _ = costs(t, scenario)
     reason = f"from the ages under scenario '{scenario.name}': are ages, durations or the term in other units?"
     check.refuse("age_term", _apart(t.age_term, age, _ABSOLUTE_TERM), "{other} " + reason, age)
-    energy = t.next_energy_j.astype(np.float64) / hover_reference_j(scenario, hover_power_w(scenario.airframe))
     reason = f"from next_energy_j under scenario '{scenario.name}': is the energy or the term in other units?"
     check.refuse("energy_term", _apart(t.energy_term, energy, _ABSOLUTE_TERM), "{other} " + reason, energy)
     weight = scenario.objective.age_weight

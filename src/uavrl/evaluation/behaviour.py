@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from uavrl.datasets.objective import costs
 from uavrl.datasets.transitions import Transitions
 from uavrl.errors import DatasetError
 from uavrl.evaluation.statistics import Estimate, combine, estimate_mean, resampling
 from uavrl.physics.age import age_integral_s2
-from uavrl.physics.energy import hover_power_w
-from uavrl.scenario import Scenario, hover_reference_j
-from uavrl.simulation.dynamics import age_term
+from uavrl.scenario import Scenario
 
 Float = NDArray[np.float64]
 
@@ -34,15 +33,9 @@ def behaviour(transitions: Transitions, scenario: Scenario, *, seed: int) -> dic
     """
     if not len(transitions):
         raise DatasetError("data has 0 rows, its behaviour needs 1 or more")
-    devices = transitions.age_s.shape[1]
-    if devices != scenario.traffic.devices:
-        raise DatasetError(f"data has {devices} devices, the scenario {scenario.traffic.devices}: they must agree")
+    cost = costs(transitions, scenario)
     age_s, next_age_s = transitions.age_s.astype(np.float64), transitions.next_age_s.astype(np.float64)
     duration_s, energy_j = transitions.duration_s.astype(np.float64), transitions.next_energy_j.astype(np.float64)
-    objective = scenario.objective
-    age_cost = age_term(scenario, age_s, next_age_s, duration_s)
-    energy_cost = energy_j / hover_reference_j(scenario, hover_power_w(scenario.airframe))
-    reward = -(objective.age_weight * age_cost + (1.0 - objective.age_weight) * energy_cost)
     priority = np.array(scenario.traffic.priority_each)
     weight = priority / priority.sum()
 
@@ -60,7 +53,7 @@ def behaviour(transitions: Transitions, scenario: Scenario, *, seed: int) -> dic
     steps = estimate_mean(length, counts)
     rows = total(np.ones(len(episode)))
     per_step = {
-        "return": total(reward),
+        "return": total(cost.reward),
         "age_per_step_s": total(next_age_s @ weight),
         "energy_per_step_j": total(energy_j),
         "duration_s": total(duration_s),

@@ -103,6 +103,13 @@ def interquartile_mean(scores: Float, seed: int, resamples: int = RESAMPLES) -> 
     return Estimate(float(_middle_mean(scores.ravel())), _middle_mean(drawn.reshape(resamples, -1))).interval()
 
 
+def run_mean(scores: Float, seed: int, resamples: int = RESAMPLES) -> Estimate:
+    """Mean over R training runs and T tasks (R, T), runs resampled within each task as in `interquartile_mean`."""
+    runs, tasks = scores.shape
+    index = np.random.default_rng(seed).integers(runs, size=(resamples, runs, tasks))
+    return Estimate(float(scores.mean()), scores[index, np.arange(tasks)].mean(axis=(1, 2)))
+
+
 def _middle_mean(values: Float) -> Float:
     """Mean over the last axis without its lowest and highest quarter, as scipy's `trim_mean(values, 0.25)`."""
     count = values.shape[-1]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, cast
 
 import numpy as np
@@ -17,7 +16,7 @@ from uavrl.agents.registry import preset
 from uavrl.datasets import load_builtin
 from uavrl.evaluation.rollouts import TRIAL_SEED, evaluation_set, fly
 from uavrl.experiments.bandit import SPACES, HybridBandit, fit_bandit, samples
-from uavrl.experiments.runner import Run
+from uavrl.experiments.runner import Run, Scores
 from uavrl.networks import NetworkConfig
 from uavrl.scenario import load_scenario
 from uavrl.training.offline import OfflineLearner, TrainConfig
@@ -107,10 +106,10 @@ def runs(problem: str, seeds: Sequence[int], variants: Iterable[str] = VARIANTS)
     return found
 
 
-def measure(run: Run) -> dict[str, float]:
+def measure(run: Run, directory: Path) -> Scores:
     """Train and judge: shares on the bandit; on the fixed layout the mean return of trial flights, by either action."""
     config = DiffusionSacConfig.model_validate(run.settings)
-    return measure_bandit(run, config) if run.problem == "bandit" else measure_flights(run, config)
+    return measure_bandit(run, config) if run.problem == "bandit" else measure_flights(run, config, directory)
 
 
 def measure_bandit(run: Run, config: DiffusionSacConfig) -> dict[str, float]:
@@ -126,13 +125,13 @@ def measure_bandit(run: Run, config: DiffusionSacConfig) -> dict[str, float]:
     return found
 
 
-def measure_flights(run: Run, config: DiffusionSacConfig) -> dict[str, float]:
+def measure_flights(run: Run, config: DiffusionSacConfig, directory: Path) -> dict[str, float]:
     """Returns of the deterministic action and of samples; learned from 30,000 mixed transitions of `fixed`."""
     scenario = load_scenario("released")
     plan = TrainConfig(scenario=scenario, agent=config, updates=run.updates, seed=run.seed)
-    learner = OfflineLearner(plan, load_builtin("fixed"))
-    with TemporaryDirectory() as directory:
-        policy = learner.run(Path(directory), lambda done, text: None)
+    data = load_builtin("fixed")
+    learner = OfflineLearner.resume(directory, data) or OfflineLearner(plan, data)
+    policy = learner.run(directory, lambda done, text: None)
     flights = evaluation_set(scenario, "fixed", run.options["episodes"], seed=run.options["trial_seed"])
 
     def returned(deterministic: bool) -> float:

@@ -1,0 +1,482 @@
+"""The paper's claims, one by one: where each stands, what was measured, and whether it holds.
+
+A claim is judged by 95 % intervals over training seeds and environments: it holds where the interval is clear on the
+claim's side, does not hold where it is clear on the other one, and is open where it is neither.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from uavrl.evaluation.statistics import Estimate, Interval, combine
+from uavrl.experiments.paper import ONLINE, OURS, PROTOCOLS
+from uavrl.experiments.plots import grouped, spread
+from uavrl.experiments.tables import estimated, interval, scores
+
+Row = Mapping[str, Any]
+
+HOLDS, FAILS, OPEN, READING, MISSING = "holds", "does not hold", "open", "depends on the reading", "not measured yet"
+BASELINES = ("CQL", "IQL", "BCQ")
+NEAR = 0.05  # "nearly identical", "comparable": within this share of the cost
+
+
+class Finding(NamedTuple):
+    """What is said of a claim."""
+
+    measured: str
+    verdict: str
+    why: str = ""
+
+
+class Claim(NamedTuple):
+    """A sentence of the paper."""
+
+    text: str
+    where: str
+    judge: Callable[[Results], Finding]
+
+
+class _MissingRuns(Exception):  # noqa: N818  # no error: a figure that has not been computed
+    """A figure of the judgement has unfinished runs."""
+
+
+class Results:
+    """Finished figures."""
+
+    def __init__(self, rows: Mapping[str, Sequence[Row]]) -> None:
+        self.rows = rows
+
+    def groups(self, figure: str) -> dict[str, list[Row]]:
+        """Rows of a figure by variant.
+
+        Raises:
+            _MissingRuns: it is not finished.
+        """
+        if figure not in self.rows:
+            raise _MissingRuns(figure)
+        return grouped(self.rows[figure])
+
+    def estimate(self, figure: str, variant: str, metric: str = "return") -> Estimate:
+        """Mean of a metric over seeds and environments."""
+        return estimated(scores(self.groups(figure)[variant], metric))
+
+    def ahead(self, figure: str, first: str, second: str, metric: str = "return", sign: float = 1.0) -> Interval:
+        """sign x (first - second), paired over environments."""
+        one, other = self.estimate(figure, first, metric), self.estimate(figure, second, metric)
+        return combine(lambda a, b: sign * (a - b), one, other).interval()
+
+    def ratio(self, figure: str, first: str, second: str, metric: str = "return") -> Interval:
+        """first / second - 1."""
+        one, other = self.estimate(figure, first, metric), self.estimate(figure, second, metric)
+        return combine(lambda a, b: a / b - 1.0, one, other).interval()
+
+
+def _verdict(intervals: Sequence[Interval]) -> str:
+    """All clear of zero above: holds; any clear below: does not; else open."""
+    if all(one.low > 0 for one in intervals):
+        return HOLDS
+    return FAILS if any(one.high < 0 for one in intervals) else OPEN
+
+
+def _listed(intervals: Mapping[str, Interval], scale: float = 1.0, unit: str = "") -> str:
+    return "; ".join(f"{name} {interval(one, scale, signed=True)}{unit}" for name, one in intervals.items())
+
+
+def _beats(figure: str, metric: str, sign: float, others: Sequence[str], unit: str) -> Callable[[Results], Finding]:
+    """Ours against each of `others`."""
+
+    def judge(results: Results) -> Finding:
+        ahead = {name: results.ahead(figure, OURS, name, metric, sign) for name in others}
+        return Finding(
+            f"{PROTOCOLS[_protocol(figure)].title}: ahead of {_listed(ahead)}{unit}", _verdict([*ahead.values()])
+        )
+
+    return judge
+
+
+def _protocol(figure: str) -> str:
+    return {"comparison": "layouts", "comparison-published": "published", "comparison-paper": "paper-objective"}[figure]
+
+
+def _both(*judges: Callable[[Results], Finding]) -> Callable[[Results], Finding]:
+    """One claim under several readings."""
+
+    def judge(results: Results) -> Finding:
+        found = []
+        for one in judges:
+            try:
+                found.append(one(results))
+            except _MissingRuns as missing:
+                found.append(Finding(f"{missing}: not computed", MISSING))
+        known = {finding.verdict for finding in found} - {MISSING}
+        verdict = MISSING if not known else known.pop() if len(known) == 1 else READING
+        measured = " / ".join(f"{finding.measured} ({finding.verdict})" for finding in found)
+        return Finding(measured, verdict, "; ".join(finding.why for finding in found if finding.why))
+
+    return judge
+
+
+def _order(figure: str) -> Callable[[Results], Finding]:
+    def judge(results: Results) -> Finding:
+        steps = {
+            "IQL over BCQ": results.ahead(figure, "IQL", "BCQ"),
+            "CQL over BCQ": results.ahead(figure, "CQL", "BCQ"),
+            f"{OURS} over IQL": results.ahead(figure, OURS, "IQL"),
+            f"{OURS} over CQL": results.ahead(figure, OURS, "CQL"),
+        }
+        return Finding(f"{PROTOCOLS[_protocol(figure)].title}: {_listed(steps)}", _verdict([*steps.values()]))
+
+    return judge
+
+
+def _comparable(figure: str, first: str, second: str) -> Callable[[Results], Finding]:
+    def judge(results: Results) -> Finding:
+        apart = results.ratio(figure, first, second)
+        if max(abs(apart.low), abs(apart.high)) <= NEAR:
+            verdict = HOLDS
+        else:
+            verdict = FAILS if min(abs(apart.low), abs(apart.high)) > NEAR and apart.low * apart.high > 0 else OPEN
+        return Finding(
+            f"{PROTOCOLS[_protocol(figure)].title}: {first} costs {_percent(apart)} more than {second}", verdict
+        )
+
+    return judge
+
+
+def _percent(value: Interval) -> str:
+    return f"{interval(value, 100.0, digits=1, signed=True)} %"
+
+
+def _throughput(figure: str) -> Callable[[Results], Finding]:
+    def judge(results: Results) -> Finding:
+        more = {name: results.ratio(figure, OURS, name, "throughput_mbps") for name in BASELINES}
+        text = "; ".join(f"{_percent(one)} against {name}" for name, one in more.items())
+        clear = _verdict([Interval(*(value - 0.35 for value in one)) for one in more.values()])
+        return Finding(f"{PROTOCOLS[_protocol(figure)].title}: throughput {text}", clear)
+
+    return judge
+
+
+def _packet(figure: str) -> Callable[[Results], Finding]:
+    def judge(results: Results) -> Finding:
+        median = results.estimate(figure, OURS, "transmission_median_s").interval()
+        mean = results.estimate(figure, OURS, "transmission_mean_s").interval()
+        verdict = HOLDS if median.low <= 0.155 else FAILS
+        text = f"median {interval(median, digits=3)} s, mean {interval(mean, digits=3)} s a packet"
+        return Finding(f"{PROTOCOLS[_protocol(figure)].title}: {text}", verdict)
+
+    return judge
+
+
+def _data(results: Results) -> Finding:
+    sent = results.estimate("comparison", OURS, "data_mb").interval()
+    lasted = results.estimate("comparison", OURS, "duration_s").interval()
+    rate = results.estimate("comparison", OURS, "throughput_mbps").interval()
+    hours = 400.0 * rate.mean / 8e3
+    return Finding(
+        f"{interval(sent, digits=1)} MB in {interval(lasted, digits=0)} s; over 400 s at this rate {hours:.2f} GB",
+        READING,
+        "400 steps of one 2 Mbit packet are at most 0.1 GB, whatever the policy; 400 s / 0.15 s x 2 Mbit = 0.67 GB "
+        "where an episode lasts 400 s and neither decisions nor moves take time",
+    )
+
+
+def _sizes(figure: str, protocol: str, names: Sequence[str], near: bool) -> Callable[[Results], Finding]:
+    def judge(results: Results) -> Finding:
+        at = list(dict.fromkeys(variant.split(" @ ")[1] for variant in results.groups(figure) if " @ " in variant))
+        small, large = at[0], at[-1]
+        worse = {name: results.ratio(figure, f"{name} @ {small}", f"{name} @ {large}") for name in names}
+        text = "; ".join(f"{name} {_percent(one)}" for name, one in worse.items())
+        if near:
+            high, low = max(one.high for one in worse.values()), min(one.low for one in worse.values())
+            verdict = HOLDS if high <= NEAR else FAILS if low > NEAR else OPEN
+        else:
+            verdict = _verdict([Interval(*(value - NEAR for value in one)) for one in worse.values()])
+        return Finding(f"{PROTOCOLS[protocol].title}: cost with {small} rows over that with {large}: {text}", verdict)
+
+    return judge
+
+
+def _quality(better: str, worse: str, name: str, others: Sequence[str]) -> Callable[[Results], Finding]:
+    """`name` beats `others` on the log `better`, and not on `worse` where that is named."""
+
+    def judge(results: Results) -> Finding:
+        here = {other: results.ahead("quality", f"{name} @ {better}", f"{other} @ {better}") for other in others}
+        text, verdicts = f"{better} log: {name} ahead of {_listed(here)}", [_verdict([*here.values()])]
+        if worse:
+            there = {other: results.ahead("quality", f"{other} @ {worse}", f"{name} @ {worse}") for other in others}
+            text += f"; {worse} log: behind by {_listed(there)}"
+            verdicts.append(_verdict([*there.values()]))
+        verdict = verdicts[0] if len(set(verdicts)) == 1 else FAILS if FAILS in verdicts else OPEN
+        return Finding(text, verdict)
+
+    return judge
+
+
+def _variant(figure: str, best: str, metric: str = "return", sign: float = 1.0) -> Callable[[Results], Finding]:
+    def judge(results: Results) -> Finding:
+        others = [name for name in results.groups(figure) if name.startswith("alpha") and name != best]
+        ahead = {name: results.ahead(figure, best, name, metric, sign) for name in others}
+        return Finding(f"{_where(figure)}: {best} ahead of {_listed(ahead)}", _verdict([*ahead.values()]))
+
+    return judge
+
+
+def _where(figure: str) -> str:
+    return PROTOCOLS["published" if figure.endswith("published") else "layouts"].title
+
+
+def _penalty(figure: str) -> Callable[[Results], Finding]:
+    def judge(results: Results) -> Finding:
+        pairs = {
+            f"eta = {eta}": results.ahead(figure, f"alpha = 0, eta = {eta}", f"alpha = 1, eta = {eta}")
+            for eta in ("0", "0.5")
+        }
+        return Finding(
+            f"{_where(figure)}: alpha = 0 ahead of alpha = 1 at {_listed(pairs)}", _verdict([*pairs.values()])
+        )
+
+    return judge
+
+
+def _competitive(figure: str) -> Callable[[Results], Finding]:
+    def judge(results: Results) -> Finding:
+        apart = results.ratio(figure, "alpha = 0, eta = 0", "alpha = 0, eta = 0.5")
+        verdict = HOLDS if apart.high <= 2 * NEAR else FAILS if apart.low > 2 * NEAR else OPEN
+        text = f"eta = 0 costs {_percent(apart)} more than eta = .5 (competitive: at most 10 %)"
+        return Finding(f"{_where(figure)}: {text}", verdict)
+
+    return judge
+
+
+def _steps(few: bool) -> Callable[[Results], Finding]:
+    def judge(results: Results) -> Finding:
+        groups = results.groups("denoising")
+        found = []
+        for schedule in ("linear", "vp"):
+            at = [int(name.split(" @ ")[1]) for name in groups if name.startswith(f"{schedule} @ ")]
+            steps = min(at) if few else max(at)
+            ahead = {name: results.ahead("denoising", f"{schedule} @ {steps}", name) for name in BASELINES}
+            verdict = _verdict([*ahead.values()])
+            if few:  # fewer than ten should fail to pass the baselines
+                verdict = {HOLDS: FAILS, FAILS: HOLDS}.get(verdict, OPEN)
+            found.append(Finding(f"{schedule}, M = {steps}: ahead of {_listed(ahead)}", verdict))
+        verdicts = {finding.verdict for finding in found}
+        verdict = verdicts.pop() if len(verdicts) == 1 else READING
+        return Finding("; ".join(finding.measured for finding in found), verdict)
+
+    return judge
+
+
+def _linear_time(results: Results) -> Finding:
+    groups = results.groups("denoising")
+    pairs = []
+    for name, rows in groups.items():
+        if name.startswith("vp @ "):
+            pairs.append((int(name.split(" @ ")[1]), float(np.mean([row["scores"]["decision_ms"] for row in rows]))))
+    steps, times = np.array(sorted(pairs)).T
+    slope, offset = np.polyfit(steps, times, 1)
+    error = float(np.abs(slope * steps + offset - times).max() / times.max())
+    text = ", ".join(f"M = {step:.0f}: {time:.2f} ms" for step, time in zip(steps, times, strict=True))
+    verdict = HOLDS if error < 0.1 and slope > 0 else FAILS
+    return Finding(f"{text}; {slope:.3f} ms a step + {offset:.2f} ms, off by at most {100 * error:.0f} %", verdict)
+
+
+def _times(results: Results) -> Finding:
+    groups = results.groups("denoising")
+    steps = sorted(int(name.split(" @ ")[1]) for name in groups if name.startswith("vp @ "))
+    enough = next((count for count in steps if count >= 20), steps[-1])  # "more than 20 steps"
+    named = {**{name: name for name in BASELINES}, f"{OURS}, M = {enough}": f"vp @ {enough}"}
+    times = {label: spread(row["scores"]["decision_ms"] for row in groups[name]).mean for label, name in named.items()}
+    text = ", ".join(f"{label} {value:.2f} ms" for label, value in times.items())
+    return Finding(text, READING, "theirs are of a V100, these of one CPU core; on either, M passes cost M times one")
+
+
+def _same_order(results: Results) -> Finding:
+    found: dict[str, Interval] = {}
+    for name in results.groups("lambda"):
+        algorithm, _, weight = name.partition(" @ ")
+        if algorithm in BASELINES:
+            found[f"{algorithm} at {weight}"] = results.ahead("lambda", f"{OURS} @ {weight}", name)
+    return Finding(f"ahead of {_listed(found)}", _verdict([*found.values()]))
+
+
+def _fair(results: Results) -> Finding:
+    ahead = {name: results.ahead("comparison", OURS, name, "jain_age") for name in BASELINES}
+    worst = {name: results.ahead("comparison", OURS, name, "worst_device_age_s", -1.0) for name in BASELINES}
+    jain = "; ".join(f"{name} {interval(one, digits=3, signed=True)}" for name, one in ahead.items())
+    return Finding(
+        f"Jain's index of 1/age against {jain}; the worst device's age lower by {_listed(worst)} s",
+        _verdict([*worst.values()]),
+        "judged by the worst device: an index near 1 can also mean that all devices are equally old",
+    )
+
+
+def _stable(results: Results) -> Finding:
+    spreads = {}
+    for name in (OURS, *BASELINES):
+        spreads[name] = float(scores(results.groups("comparison")[name], "return").mean(axis=1).std(ddof=1))
+    text = "; ".join(f"{name} {value:.1f}" for name, value in spreads.items())
+    verdict = HOLDS if spreads[OURS] <= min(spreads[name] for name in BASELINES) else FAILS
+    return Finding(f"standard deviation of the final return over training seeds: {text}", verdict)
+
+
+def _biased(results: Results) -> Finding:
+    whole, part = f"{OURS} @ whole log", f"{OURS} @ two devices never served"
+    worse = results.ratio("biased", part, whole)
+    ahead = {name: results.ahead("biased", part, f"{name} @ two devices never served") for name in (*BASELINES, "BC")}
+    text = f"{OURS} costs {_percent(worse)} more than with the whole log; there ahead of {_listed(ahead)}"
+    return Finding(text, HOLDS if worse.low > NEAR else FAILS if worse.high < NEAR else OPEN)
+
+
+def _online(metric: str, sign: float) -> Callable[[Results], Finding]:
+    def judge(results: Results) -> Finding:
+        ahead = {name: results.ahead("online", ONLINE, name, metric, sign) for name in ("TDM", "Saver", "random walk")}
+        return Finding(f"ahead of {_listed(ahead)}", _verdict([*ahead.values()]))
+
+    return judge
+
+
+def _imitation(figure: str) -> Callable[[Results], Finding]:
+    def judge(results: Results) -> Finding:
+        ahead = results.ahead(figure, "alpha = 0, eta = 0.5", "alpha = 0, eta = 1")
+        return Finding(
+            f"{_where(figure)}: eta = .5 ahead of cloning by {interval(ahead, signed=True)}", _verdict([ahead])
+        )
+
+    return judge
+
+
+def _near_planner(results: Results) -> Finding:
+    over = {name: results.ratio("comparison", name, "planner") for name in (OURS, "IQL", "CQL")}
+    text = "; ".join(f"{name} {_percent(one)}" for name, one in over.items())
+    return Finding(f"cost over the planner's: {text}", HOLDS if over[OURS].high < NEAR else FAILS)
+
+
+_COMPARISONS = ("comparison", "comparison-published", "comparison-paper")
+_VARIANTS = ("variants", "variants-published")
+_BEST = "alpha = 0, eta = 0.5"
+
+CLAIMS: tuple[Claim, ...] = (
+    Claim(
+        "Online SAC significantly outperforms TDM, Saver and random walk",
+        "V-C, Fig. Online_perf a",
+        _online("return", 1.0),
+    ),
+    Claim("... with a lower age than all three", "V-C, Fig. Online_perf b", _online("age_per_step_s", -1.0)),
+    Claim("... and a lower energy than all three", "V-C, Fig. Online_perf c", _online("energy_per_step_j", -1.0)),
+    Claim(
+        "Diffusion-SAC achieves the highest return, ahead of CQL, IQL and BCQ",
+        "Abstract; V-D, Fig. Baselines a",
+        _both(*(_beats(figure, "return", 1.0, BASELINES, "") for figure in _COMPARISONS)),
+    ),
+    Claim(
+        "Diffusion-SAC has the lowest age",
+        "V-D, Fig. Baselines b",
+        _both(*(_beats(figure, "age_per_step_s", -1.0, BASELINES, " s") for figure in _COMPARISONS)),
+    ),
+    Claim(
+        "Diffusion-SAC has the lowest energy",
+        "V-D, Fig. Baselines c",
+        _both(*(_beats(figure, "energy_per_step_j", -1.0, BASELINES, " J") for figure in _COMPARISONS)),
+    ),
+    Claim("BCQ < IQL, CQL < Diffusion-SAC", "V-D, Fig. Baselines a", _both(*map(_order, _COMPARISONS))),
+    Claim(
+        "IQL and CQL perform comparably",
+        "V-D, Fig. Baselines a",
+        _both(*(_comparable(figure, "IQL", "CQL") for figure in _COMPARISONS)),
+    ),
+    Claim("IQL and CQL fall short of the optimal policy, Diffusion-SAC does not", "V-D", _near_planner),
+    Claim("35 % more throughput", "Abstract; V-D; VI", _both(*map(_throughput, _COMPARISONS[:2]))),
+    Claim("0.15 s to send a packet", "V-D, Fig. Rates a", _both(*map(_packet, _COMPARISONS[:2]))),
+    Claim("More than 0.65 GB in one episode", "V-D, Fig. Rates b", _data),
+    Claim(
+        "alpha = 0, eta = .5 is the best variant",
+        "V-D, Fig. diff_only a",
+        _both(*(_variant(figure, _BEST) for figure in _VARIANTS)),
+    ),
+    Claim(
+        "... also in age",
+        "V-D, Fig. diff_only b",
+        _both(*(_variant(figure, _BEST, "age_per_step_s", -1.0) for figure in _VARIANTS)),
+    ),
+    Claim(
+        "... and in energy",
+        "V-D, Fig. diff_only c",
+        _both(*(_variant(figure, _BEST, "energy_per_step_j", -1.0) for figure in _VARIANTS)),
+    ),
+    Claim("alpha = 0, eta = 0 is competitive", "V-D", _both(*map(_competitive, _VARIANTS))),
+    Claim("CQL over-constrains: alpha = 1 is worse, with cloning or without", "V-D", _both(*map(_penalty, _VARIANTS))),
+    Claim("Cloning alone (alpha = 0, eta = 1) is worse on a mixed log", "V-D", _both(*map(_imitation, _VARIANTS))),
+    Claim(
+        "10 k rows are as good as 50 k for Diffusion-SAC",
+        "V-D, Fig. Datasets a",
+        _both(_sizes("sizes", "layouts", (OURS,), True), _sizes("sizes-published", "published", (OURS,), True)),
+    ),
+    Claim(
+        "CQL, IQL and BCQ degrade significantly with fewer rows",
+        "V-D, Fig. Datasets a",
+        _both(_sizes("sizes", "layouts", BASELINES, False), _sizes("sizes-published", "published", BASELINES, False)),
+    ),
+    Claim("On a bad log CQL is relatively strong", "V-D, Fig. Datasets c", _quality("bad", "", "CQL", ("IQL", "BCQ"))),
+    Claim(
+        "... and fails to exploit a good one", "V-D, Fig. Datasets b", _quality("bad", "good", "CQL", ("IQL", "BCQ"))
+    ),
+    Claim(
+        "BCQ is better than CQL on a good log and worse on a bad one",
+        "V-D, Fig. Datasets b, c",
+        _quality("good", "bad", "BCQ", ("CQL",)),
+    ),
+    Claim(
+        "Diffusion-SAC is ahead of the baselines on a bad log, too",
+        "V-D, Fig. Datasets c",
+        _quality("bad", "", OURS, BASELINES),
+    ),
+    Claim("Fewer than 10 denoising steps fail to surpass the baselines", "V-D, Fig. Denoising_steps a", _steps(True)),
+    Claim("More than 20 steps outperform all baselines", "V-D, Fig. Denoising_steps a", _steps(False)),
+    Claim("Decision time grows linearly with the steps", "V-D, Fig. Denoising_steps b", _linear_time),
+    Claim("2 ms a decision for the baselines, 12 ms for Diffusion-SAC", "V-D, Fig. Denoising_steps b", _times),
+    Claim("lambda does not change the order of the algorithms", "V-D", _same_order),
+    Claim("Fairness among devices improves", "Abstract; VI", _fair),
+    Claim("More stable than the baselines", "Abstract; VI", _stable),
+    Claim("A severely biased log degrades it", "V-D, last paragraph", _biased),
+)
+
+
+def judged(results: Results) -> list[tuple[Claim, Finding]]:
+    """Every claim with what is said of it."""
+    found = []
+    for claim in CLAIMS:
+        try:
+            found.append((claim, claim.judge(results)))
+        except _MissingRuns as missing:
+            found.append((claim, Finding(f"{missing}: not computed", MISSING)))
+    return found
+
+
+def markdown(results: Results, about: str) -> str:
+    """CLAIMS.md."""
+    found = judged(results)
+    counts = {verdict: sum(finding.verdict == verdict for _, finding in found) for verdict in _VERDICTS}
+    lines = [
+        "# The paper's claims",
+        "",
+        "Eldeeb & Alves, arXiv:2606.16331. "
+        + ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+        + ".",
+        "",
+        about,
+        "",
+        "| | claim | where | measured | verdict | why |",
+        "|---|---|---|---|---|---|",
+    ]
+    for number, (claim, finding) in enumerate(found, start=1):
+        cells = (str(number), claim.text, claim.where, finding.measured, f"**{finding.verdict}**", finding.why)
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+_VERDICTS = (HOLDS, FAILS, READING, OPEN, MISSING)

@@ -1,0 +1,305 @@
+"""The paper's experiments as data: protocols, scales, and for each figure the runs that it is drawn from.
+
+A run learns once and is drawn in every figure that asks for it. What a figure looks like is in `plots`, what the runs
+say about the paper's sentences in `claims`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+from uavrl.agents.registry import AGENTS, Offline, preset
+from uavrl.agents.sac import SacConfig
+from uavrl.experiments.flights import Data, Setting
+from uavrl.experiments.runner import Run
+from uavrl.scenario import Scenario, load_scenario
+
+OURS = "Diffusion-SAC"
+ALGORITHMS = {OURS: "diffusion_sac", "CQL": "cql", "IQL": "iql", "BCQ": "bcq", "BC": "bc"}
+PAPER_HEURISTICS = {"TDM": "tdm", "Saver": "saver", "random walk": "random_walk"}
+REFERENCES = {**PAPER_HEURISTICS, "index at best hover": "hover", "planner": "planner"}
+YARDSTICK, ROUND_ROBIN = "planner", "TDM"
+ONLINE = "online SAC"
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How much is computed."""
+
+    updates: int  # gradient steps with our settings
+    published_updates: int  # and with the paper's, which has 70,000: 150 passes over 30,000 rows in batches of 64
+    headline_seeds: int  # of the comparisons
+    sweep_seeds: int  # of everything else
+    online_flights: int
+    episodes: int
+    fading_seeds: int
+    points: int  # of a learning curve
+    sizes: tuple[int, ...]
+    denoising_steps: tuple[int, ...]
+    age_weights: tuple[float, ...]
+    max_steps: int | None = None  # of a flight; None: the scenario's own
+
+
+SCALES = {
+    "smoke": Scale(10, 4, 2, 1, 2, 4, 1, 2, (500, 1_000), (2, 5), (0.1, 0.9), 20),
+    "standard": Scale(4_000, 4_000, 5, 2, 700, 100, 3, 8, (10_000, 30_000, 50_000), (5, 10, 20, 50), (0.1, 0.5, 0.9)),
+    "full": Scale(
+        12_000,
+        70_000,
+        5,
+        5,
+        700,
+        100,
+        10,
+        15,
+        (10_000, 20_000, 30_000, 40_000, 50_000),
+        (5, 10, 15, 20, 30, 40, 50),
+        (0.1, 0.3, 0.5, 0.7, 0.9),
+    ),
+}
+
+
+class Protocol(NamedTuple):
+    """Where algorithms meet: scenario, layouts, data, and whose settings they bring."""
+
+    title: str
+    scenario: Scenario
+    layouts: Literal["fixed", "random"]
+    data: str
+    preset: Literal["default", "paper"]
+    changes: Mapping[str, Any] = {}  # of every agent's settings
+
+    def deterministic(self, algorithm: str) -> bool:
+        """Which action is judged: the one that the algorithm's class says is its best; in the paper a sample."""
+        agent = AGENTS[type(preset(ALGORITHMS[algorithm], self.preset))]
+        return self.preset == "default" and bool(getattr(agent, "acts_best_deterministically", False))
+
+
+PROTOCOLS = {
+    "layouts": Protocol(
+        "unseen layouts, set network, our settings, scenario released",
+        load_scenario("released"),
+        "random",
+        "layouts",
+        "default",
+    ),
+    "published": Protocol(
+        "one layout, the paper's perceptron and settings, scenario released",
+        load_scenario("released"),
+        "fixed",
+        "fixed",
+        "paper",
+    ),
+    "paper-objective": Protocol(
+        "unseen layouts, set network, our settings, scenario paper",
+        load_scenario("paper"),
+        "random",
+        "layouts",
+        "default",
+    ),
+}
+PRIORITIES = (0.25, 0.25, 0.25) + (0.25 / 7,) * 7  # three devices of ten weigh three quarters
+STARVED = (1, 2)  # devices whose services the biased log lacks
+
+
+def _merged(config: Offline, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as JSON, with nested changes."""
+    data = config.model_dump()
+    for name, value in changes.items():
+        data[name] = data[name] | value if isinstance(value, dict) else value
+    return type(config).model_validate(data).model_dump(mode="json")
+
+
+class Plan:
+    """The runs of one scale."""
+
+    def __init__(self, scale: Scale) -> None:
+        self.scale = scale
+
+    def learned(
+        self,
+        algorithm: str,
+        protocol: Protocol,
+        seeds: int,
+        *,
+        variant: str | None = None,
+        changes: Mapping[str, Any] | None = None,
+        data: Mapping[str, Any] | None = None,
+    ) -> list[Run]:
+        """One algorithm under a protocol with training seeds 0 to `seeds` - 1.
+
+        Args:
+            algorithm: name of `ALGORITHMS`.
+            protocol: where.
+            seeds: how many.
+            variant: what a figure calls it; by default the algorithm.
+            changes: of its settings.
+            data: fields of `Data` that differ from 30,000 mixed rows of the protocol's log.
+        """
+        settings = _merged(preset(ALGORITHMS[algorithm], protocol.preset), {**protocol.changes, **(changes or {})})
+        published = protocol.preset == "paper"
+        rows = Data(**{"name": protocol.data, "size": self.size, **(data or {})})
+        options = self._setting(protocol, rows, protocol.deterministic(algorithm))
+        updates = self.scale.published_updates if published else self.scale.updates
+        return [
+            Run(
+                problem="offline",
+                variant=variant or algorithm,
+                settings=settings,
+                updates=updates,
+                seed=seed,
+                options=options,
+            )
+            for seed in range(seeds)
+        ]
+
+    @property
+    def size(self) -> int:
+        """Rows of the usual log, the paper's 30,000 where the scale has as many."""
+        return min(30_000, max(self.scale.sizes))
+
+    def _setting(self, protocol: Protocol, data: Data | None = None, deterministic: bool = True) -> dict[str, Any]:
+        scenario = protocol.scenario
+        if self.scale.max_steps is not None:
+            scenario = scenario.replace(max_steps=self.scale.max_steps)
+        return Setting(
+            scenario=scenario,
+            layouts=protocol.layouts,
+            data=data,
+            deterministic=deterministic,
+            episodes=self.scale.episodes,
+            fading_seeds=self.scale.fading_seeds,
+            points=self.scale.points,
+        ).model_dump(mode="json")
+
+    def references(self, protocol: Protocol, names: Mapping[str, str] = REFERENCES) -> list[Run]:
+        """What needs no learning, in the same environments."""
+        options = self._setting(protocol)
+        return [
+            Run(problem="policy", variant=name, settings={"policy": policy}, updates=0, seed=0, options=options)
+            for name, policy in names.items()
+        ]
+
+    def online(self) -> list[Run]:
+        """The paper's first figure."""
+        protocol = PROTOCOLS["published"]
+        options = self._setting(protocol)
+        settings = SacConfig().model_dump(mode="json")
+        flights = self.scale.online_flights
+        return self.references(protocol) + [
+            Run(problem="online", variant=ONLINE, settings=settings, updates=flights, seed=seed, options=options)
+            for seed in range(self.scale.sweep_seeds)
+        ]
+
+    def comparison(self, protocol: Protocol) -> list[Run]:
+        """Every algorithm on equal data."""
+        seeds = self.scale.headline_seeds
+        learned = [run for name in ALGORITHMS for run in self.learned(name, protocol, seeds)]
+        by_seed = sorted(learned, key=lambda run: run.seed)  # one seed of all first
+        return self.references(protocol) + by_seed
+
+    def variants(self, protocol: Protocol) -> list[Run]:
+        """The six (alpha, eta)."""
+        every = []
+        for alpha in (0.0, 1.0):
+            for eta in (0.0, 0.5, 1.0):
+                changes = {"cql_weight": alpha, "bc_weight": eta}
+                name = f"alpha = {alpha:g}, eta = {eta:g}"
+                every += self.learned(OURS, protocol, self.scale.sweep_seeds, variant=name, changes=changes)
+        own = self.learned(OURS, protocol, self.scale.sweep_seeds, variant="our settings")
+        return self.references(protocol) + every + (own if protocol.preset == "default" else [])
+
+    def sizes(self, protocol: Protocol) -> list[Run]:
+        """Rows to learn from."""
+        return self._over_data(protocol, {f"{size:,}": {"size": size} for size in self.scale.sizes})
+
+    def qualities(self, protocol: Protocol) -> list[Run]:
+        """The last third of the log, the first third, and as many rows of all of it."""
+        rows = self.size // 2
+        return self._over_data(protocol, {name: {"size": rows, "quality": name} for name in ("good", "mixed", "bad")})
+
+    def _over_data(self, protocol: Protocol, choices: Mapping[str, Mapping[str, Any]]) -> list[Run]:
+        seeds = self.scale.sweep_seeds
+        return self.references(protocol) + [
+            run
+            for label, data in choices.items()
+            for name in ALGORITHMS
+            for run in self.learned(name, protocol, seeds, variant=f"{name} @ {label}", data=data)
+        ]
+
+    def denoising(self, protocol: Protocol) -> list[Run]:
+        """Steps M of the chain, under two noise schedules; the baselines beside them."""
+        seeds, found = self.scale.sweep_seeds, self.references(protocol)
+        for name in list(ALGORITHMS)[1:]:
+            found += self.learned(name, protocol, seeds)
+        for schedule in ("linear", "vp"):
+            for steps in self.scale.denoising_steps:
+                changes = {"diffusion": {"schedule": schedule, "steps": steps}}
+                found += self.learned(OURS, protocol, seeds, variant=f"{schedule} @ {steps}", changes=changes)
+        return found
+
+    def age_weights(self) -> list[Run]:
+        """Lambda, from age alone to energy alone: rewards relabelled from the logged terms."""
+        found = []
+        for weight in self.scale.age_weights:
+            base = PROTOCOLS["paper-objective"]
+            protocol = base._replace(scenario=base.scenario.replace(age_weight=weight))
+            for name in ALGORITHMS:
+                found += self.learned(name, protocol, self.scale.sweep_seeds, variant=f"{name} @ {weight:g}")
+        return found
+
+    def priorities(self) -> list[Run]:
+        """Devices that matter more than others."""
+        base = PROTOCOLS["layouts"]
+        protocol = base._replace(scenario=base.scenario.replace(priority=PRIORITIES))
+        learned = [run for name in ALGORITHMS for run in self.learned(name, protocol, self.scale.sweep_seeds)]
+        return self.references(protocol) + learned
+
+    def biased(self) -> list[Run]:
+        """A log in which two devices are never served."""
+        protocol = PROTOCOLS["published"]._replace(preset="default")
+        choices = {"whole log": {}, "two devices never served": {"never_served": STARVED}}
+        return self._over_data(protocol, choices)
+
+
+class Figure(NamedTuple):
+    """A figure of the paper, or beside it."""
+
+    title: str
+    runs: Callable[[Plan], list[Run]]
+    kind: Literal["curves", "lines", "bars", "front", "fairness", "rates"]
+    axis: str = ""  # what stands behind the @ of a variant
+
+
+def _at(method: Callable[[Plan, Protocol], list[Run]], protocol: str) -> Callable[[Plan], list[Run]]:
+    return lambda plan: method(plan, PROTOCOLS[protocol])
+
+
+# file's name -> figure; in the order in which they are computed
+FIGURES: dict[str, Figure] = {
+    "comparison": Figure("Offline algorithms, unseen layouts", _at(Plan.comparison, "layouts"), "curves"),
+    "comparison-published": Figure("Offline algorithms, as published", _at(Plan.comparison, "published"), "curves"),
+    "rates": Figure("Transmission time and data", _at(Plan.comparison, "layouts"), "rates"),
+    "fairness": Figure("Fairness", _at(Plan.comparison, "layouts"), "fairness"),
+    "online": Figure("Online SAC and the heuristics", Plan.online, "curves"),
+    "variants": Figure("Weights of the penalty and of cloning", _at(Plan.variants, "layouts"), "curves"),
+    "sizes": Figure("Rows to learn from", _at(Plan.sizes, "layouts"), "lines", "rows"),
+    "quality": Figure("Good and bad logs", _at(Plan.qualities, "layouts"), "bars", "log"),
+    "denoising": Figure("Denoising steps", _at(Plan.denoising, "layouts"), "lines", "denoising steps M"),
+    "biased": Figure("A severely biased log", Plan.biased, "bars", "log"),
+    "comparison-paper": Figure("Offline algorithms, scenario paper", _at(Plan.comparison, "paper-objective"), "curves"),
+    "lambda": Figure("Age against energy", Plan.age_weights, "front", "lambda"),
+    "priorities": Figure("Unequal priorities", Plan.priorities, "fairness"),
+    "variants-published": Figure(
+        "Weights of the penalty and of cloning, as published", _at(Plan.variants, "published"), "curves"
+    ),
+    "sizes-published": Figure("Rows to learn from, as published", _at(Plan.sizes, "published"), "lines", "rows"),
+}
+
+
+def wanted(scale: Scale, figures: Iterator[str] | tuple[str, ...] = tuple(FIGURES)) -> dict[str, list[Run]]:
+    """Each figure's runs."""
+    plan = Plan(scale)
+    return {name: FIGURES[name].runs(plan) for name in figures}
