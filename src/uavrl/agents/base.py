@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Literal
 
 import torch
@@ -106,6 +107,7 @@ class Agent(ABC):
     networks: nn.ModuleDict  # everything that is saved, targets and averages included
     optimisers: dict[str, torch.optim.Optimizer]
     acts_best_deterministically = False  # whether a trial should fly its deterministic action rather than a sample
+    learning_only: Mapping[str, str] = MappingProxyType({})  # networks that no decision asks -> one of the same shape
     progress = 0.0  # share of the training that is done; a loop that knows its length sets it before an update
 
     @abstractmethod

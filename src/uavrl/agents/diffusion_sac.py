@@ -17,6 +17,7 @@ penalty over choices alone.
 from __future__ import annotations
 
 from copy import deepcopy
+from types import MappingProxyType
 from typing import Literal, Self
 
 import torch
@@ -134,6 +135,7 @@ class DiffusionSac(Agent):
 
     config: DiffusionSacConfig
     acts_best_deterministically = True  # the chain's noise is jitter, and every metre of it costs time
+    learning_only = MappingProxyType({"target.": "critic.", "actor.denoiser.": "actor.average."})
 
     def __init__(self, spaces: Spaces, config: DiffusionSacConfig) -> None:
         if spaces.choices == 1 and config.q_scale == "spread" and config.bc_weight < 1:

@@ -17,7 +17,7 @@ from uavrl.scenario import Scenario
 
 
 def resolve(spec: str, scenario: Scenario) -> Policy:
-    """A heuristic by name, a checkpoint by its directory, an exported policy by its file, your own as `module:Class`.
+    """A heuristic by name, a checkpoint by its directory or as pretrained:NAME, an exported file, your module:Class.
 
     Raises:
         ConfigError: there is no such policy, or `module:Class` cannot be imported or is no policy.
@@ -25,10 +25,12 @@ def resolve(spec: str, scenario: Scenario) -> Policy:
     """
     if spec in POLICIES:
         return make_policy(spec)
-    if Path(spec).is_dir():
+    if Path(spec).is_dir() or spec.startswith("pretrained:"):
         from uavrl.training.policy import load_policy  # here: torch is slow to import
 
-        return load_policy(Path(spec), scenario)
+        policy = load_policy(Path(spec), scenario)
+        policy.name = spec if spec.startswith("pretrained:") else policy.name
+        return policy
     if spec.endswith(".onnx"):
         if find_spec("onnxruntime") is None:
             raise ConfigError(f"policy '{spec}' needs onnxruntime, install it: pip install 'uavrl[deploy]'")
@@ -39,7 +41,7 @@ def resolve(spec: str, scenario: Scenario) -> Policy:
         return _import(spec, scenario)
     raise ConfigError(
         f"policy '{spec}' does not exist, allowed: {', '.join(POLICIES)}, the directory of a checkpoint, "
-        "an .onnx file, module:Class"
+        "pretrained:NAME, an .onnx file, module:Class"
     )
 
 

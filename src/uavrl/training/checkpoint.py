@@ -36,6 +36,8 @@ from uavrl.datasets.files import sync
 from uavrl.errors import CheckpointError
 
 MANIFEST = "checkpoint.json"
+PRETRAINED = "pretrained:"  # opens the name of a policy that is installed with the package
+_INSTALLED = Path(__file__).parent / "installed"
 Tensors = dict[str, Tensor]
 
 
@@ -118,9 +120,32 @@ def recover(directory: Path) -> Path | None:
 
 
 def checkpoint_in(path: Path) -> Path:
-    """Where the checkpoint is, of a run's directory or of the checkpoint's own; nothing is moved."""
+    """Where the checkpoint is, of a run's directory, of the checkpoint's own, or of `pretrained:NAME`.
+
+    Raises:
+        CheckpointError: no such pretrained policy.
+    """
+    if str(path).startswith(PRETRAINED):
+        return pretrained(str(path).removeprefix(PRETRAINED))
     place = Path(path) / "checkpoint"
     return place if place.is_dir() or _old(place).is_dir() else Path(path)
+
+
+def pretrained_names() -> tuple[str, ...]:
+    """Policies installed with the package."""
+    return tuple(sorted(path.parent.name for path in _INSTALLED.glob(f"*/{MANIFEST}")))
+
+
+def pretrained(name: str) -> Path:
+    """Directory of an installed policy's checkpoint, its model card in README.md beside it.
+
+    Raises:
+        CheckpointError: there is none of this name.
+    """
+    if name not in pretrained_names():
+        allowed = ", ".join(PRETRAINED + known for known in pretrained_names())
+        raise CheckpointError(f"pretrained policy '{name}' does not exist, allowed: {allowed}")
+    return _INSTALLED / name
 
 
 def agent_tensors(agent: Agent) -> dict[str, Tensors]:

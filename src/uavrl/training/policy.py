@@ -16,7 +16,14 @@ from uavrl.networks import Spaces
 from uavrl.scenario import Scenario, parse_scenario
 from uavrl.simulation.state import FlightAction
 from uavrl.training.batches import OBSERVATION_OF, to_tensors
-from uavrl.training.checkpoint import Checkpoint, checkpoint_in, load_checkpoint, restore_networks
+from uavrl.training.checkpoint import (
+    Checkpoint,
+    Tensors,
+    checkpoint_in,
+    load_checkpoint,
+    restore_networks,
+    save_checkpoint,
+)
 
 
 class AgentPolicy:
@@ -51,8 +58,38 @@ def load_agent(checkpoint: Checkpoint, path: Path) -> Agent:
     except (KeyError, ValidationError):
         raise CheckpointError(f"checkpoint '{path}' holds no agent of this version of uavrl") from None
     agent = make_agent(spaces, config)
-    restore_networks(agent, checkpoint.tensors["networks"])
+    restore_networks(agent, _with_learning_only(agent, checkpoint.tensors["networks"]))
     return agent
+
+
+def _with_learning_only(agent: Agent, networks: Tensors) -> Tensors:
+    """Weights of all networks of an agent: those that `ship` left out are those of the network in their place."""
+    filled = dict(networks)
+    for left_out, instead in agent.learning_only.items():
+        if not any(name.startswith(left_out) for name in networks):
+            filled |= {
+                left_out + name.removeprefix(instead): value
+                for name, value in networks.items()
+                if name.startswith(instead)
+            }
+    return filled
+
+
+def ship(run: Path, out: Path) -> None:
+    """Write the run's last checkpoint to `out` without optimisers, generators and networks that no decision asks.
+
+    It decides as the run does and is a checkpoint like any other, but no training goes on from it.
+
+    Raises:
+        CheckpointError: `run` holds no checkpoint.
+    """
+    place = checkpoint_in(run)
+    checkpoint = load_checkpoint(place)
+    left_out = tuple(load_agent(checkpoint, place).learning_only)
+    networks = {name: value for name, value in checkpoint.tensors["networks"].items() if not name.startswith(left_out)}
+    kept = ("agent", "config", "spaces", "scenario", "train", "data", "step")
+    document = {key: checkpoint.document[key] for key in kept if key in checkpoint.document}
+    save_checkpoint(out, {"kind": "policy", **document}, {"networks": networks})
 
 
 def load_policy(path: Path, scenario: Scenario, candidates: int | None = None) -> AgentPolicy:
