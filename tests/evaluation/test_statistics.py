@@ -15,6 +15,7 @@ from uavrl.evaluation.statistics import (
     normalised_return,
     probability_of_improvement,
     resampling,
+    run_mean,
     unit_means,
 )
 
@@ -115,12 +116,26 @@ def test_interquartile_mean_is_the_trimmed_mean_of_all_runs() -> None:
     assert interval.low < interval.mean < interval.high
 
 
-def test_interquartile_mean_resamples_runs_within_each_task() -> None:
+def test_interquartile_mean_resamples_whole_runs() -> None:
+    apart = np.array([[0.0] * 8, [4.0] * 8, [8.0] * 8])  # a run's tasks share its luck: no task evens it out
+    assert interquartile_mean(apart, seed=0)[1:] == (0.0, 8.0)
     scores = np.array([[0.0, 10.0, 20.0, 30.0]] * 4)  # tasks differ, runs of a task do not: nothing to resample
     assert interquartile_mean(scores, seed=0) == (15, 15, 15)
     two = np.array([[0.0], [1.0]])  # every resample is one of four
     expected = {float(np.mean(pair)) for pair in itertools.product((0.0, 1.0), repeat=2)}
     assert {*interquartile_mean(two, seed=0)} <= expected
+
+
+def test_the_mean_of_runs_spreads_as_their_number_says() -> None:
+    luck = np.random.default_rng(0).normal(size=(6, 1))
+    estimate = run_mean(luck + np.zeros((6, 50)), seed=0)
+    assert estimate.point == pytest.approx(luck.mean())
+    assert estimate.replicates.std() == pytest.approx(luck.std(ddof=1) / 6**0.5, rel=0.05)
+
+
+def test_probability_of_improvement_resamples_whole_runs() -> None:
+    first, second = np.array([[0.0] * 9, [2.0] * 9]), np.array([[1.0] * 9])
+    assert probability_of_improvement(first, second, seed=0) == (0.5, 0.0, 1.0)
 
 
 def test_probability_of_improvement_counts_pairs_of_runs() -> None:

@@ -93,21 +93,29 @@ def normalised_return(returned: Estimate, tdm: Estimate, planner: Estimate) -> E
 
 
 def interquartile_mean(scores: Float, seed: int, resamples: int = RESAMPLES) -> Interval:
-    """Mean of the middle half of the scores of R training runs on T tasks (R, T), runs resampled within each task.
+    """Mean of the middle half of the scores of R training runs on T tasks (R, T), whole runs resampled.
 
-    Source: Agarwal et al. 2021, "Deep RL at the edge of the statistical precipice", stratified bootstrap.
+    Source: Agarwal et al. 2021, "Deep RL at the edge of the statistical precipice". Their tasks are learned apart, and
+    they resample runs within each; here a run flies every task, so its tasks share its luck and stay together.
     """
-    runs, tasks = scores.shape
-    index = np.random.default_rng(seed).integers(runs, size=(resamples, runs, tasks))
-    drawn = scores[index, np.arange(tasks)]
+    drawn = scores[_drawn_runs(len(scores), seed, resamples)]
     return Estimate(float(_middle_mean(scores.ravel())), _middle_mean(drawn.reshape(resamples, -1))).interval()
 
 
 def run_mean(scores: Float, seed: int, resamples: int = RESAMPLES) -> Estimate:
-    """Mean over R training runs and T tasks (R, T), runs resampled within each task as in `interquartile_mean`."""
-    runs, tasks = scores.shape
-    index = np.random.default_rng(seed).integers(runs, size=(resamples, runs, tasks))
-    return Estimate(float(scores.mean()), scores[index, np.arange(tasks)].mean(axis=(1, 2)))
+    """Mean over R training runs and T tasks (R, T), whole runs resampled.
+
+    Replicates spread as the mean of R runs does: resampling R of them spreads by sqrt((R - 1) / R) too little, which
+    is made up for.
+    """
+    runs = len(scores)
+    mean, means = float(scores.mean()), scores.mean(axis=1)
+    drawn = means[_drawn_runs(runs, seed, resamples)].mean(axis=1)
+    return Estimate(mean, mean + (drawn - mean) * np.sqrt(runs / max(runs - 1, 1)))
+
+
+def _drawn_runs(runs: int, seed: int, resamples: int) -> NDArray[np.int64]:
+    return np.random.default_rng(seed).integers(runs, size=(resamples, runs))
 
 
 def _middle_mean(values: Float) -> Float:
@@ -121,12 +129,10 @@ def _middle_mean(values: Float) -> Float:
 def probability_of_improvement(first: Float, second: Float, seed: int, resamples: int = RESAMPLES) -> Interval:
     """P(a run of `first` (R, T) scores above a run of `second` (Q, T)), ties half, averaged over tasks.
 
-    Source: as `interquartile_mean`; runs are resampled within each task, both sides independently.
+    Source: as `interquartile_mean`; whole runs are resampled, both sides independently.
     """
     wins = (first[:, None] > second[None]) + 0.5 * (first[:, None] == second[None])  # (R, Q, T)
-    generator = np.random.default_rng(seed)
-    tasks = first.shape[1]
-    left = generator.integers(len(first), size=(resamples, len(first), 1, tasks))
-    right = generator.integers(len(second), size=(resamples, 1, len(second), tasks))
-    replicates = wins[left, right, np.arange(tasks)].mean(axis=(1, 2, 3))
+    each = wins.mean(axis=2)  # (R, Q)
+    left, right = _drawn_runs(len(first), seed, resamples), _drawn_runs(len(second), seed + 1, resamples)
+    replicates = each[left[:, :, None], right[:, None]].mean(axis=(1, 2))
     return Estimate(float(wins.mean()), replicates).interval()

@@ -61,7 +61,7 @@ class Results:
 
     def estimate(self, figure: str, variant: str, metric: str = "return") -> Estimate:
         """Mean of a metric over seeds and environments."""
-        return estimated(scores(self.groups(figure)[variant], metric))
+        return estimated(scores(self.groups(figure)[variant], metric), variant)
 
     def ahead(self, figure: str, first: str, second: str, metric: str = "return", sign: float = 1.0) -> Interval:
         """sign x (first - second), paired over environments."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -53,11 +54,11 @@ def scores(rows: Sequence[Row], metric: str) -> Float:
 def compare(rows: Sequence[Row], ours: str = OURS) -> list[Compared]:
     """Every variant of `rows`, in their order.
 
-    Intervals of a return and of excess costs resample the environments, which every policy shares, and the training
-    seeds within each; those of `middle` and `improves` the seeds within each environment.
+    Intervals of a return, of excess costs and of differences resample the environments, which every policy shares, and
+    whole training seeds; those of `middle` and `improves` whole training seeds.
     """
     groups = grouped(rows)
-    estimates = {name: estimated(scores(seeds, "return")) for name, seeds in groups.items()}
+    estimates = {name: estimated(scores(seeds, "return"), name) for name, seeds in groups.items()}
     found = []
     for name, seeds in groups.items():
         own, learned = scores(seeds, "return"), seeds[0]["problem"] != "policy"
@@ -81,13 +82,13 @@ def compare(rows: Sequence[Row], ours: str = OURS) -> list[Compared]:
     return found
 
 
-def estimated(values: Float) -> Estimate:
-    """Mean of (R, E): environments resampled, the same ones for every policy, and seeds within each."""
+def estimated(values: Float, name: str = "") -> Estimate:
+    """Mean of (R, E): environments resampled, the same for every policy, and whole seeds, each name's by themselves."""
     known = np.isfinite(values).all(axis=0)  # a flight without a packet has no transmission time
     environments = estimate_mean(np.where(known, values.mean(axis=0), np.nan), resampling(values.shape[1], SEED))
     if len(values) == 1 or not known.any():
         return environments
-    seeds = run_mean(values[:, known], SEED + 1)
+    seeds = run_mean(values[:, known], zlib.crc32(name.encode()))
     return Estimate(environments.point, environments.replicates + (seeds.replicates - seeds.point))
 
 

@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from tests.experiments.rows import cost_of, finished_figures, row
+from uavrl.experiments.claims import CLAIMS, FAILS, HOLDS, MISSING, OPEN, READING, Results, judged, markdown
+from uavrl.experiments.paper import FIGURES
+from uavrl.experiments.runner import Run
+
+
+@pytest.fixture(scope="module")
+def figures() -> dict[str, list[dict[str, Any]]]:
+    return finished_figures()
+
+
+def verdict(figures: dict[str, list[dict[str, Any]]], text: str) -> str:
+    (found,) = [finding for claim, finding in judged(Results(figures)) if claim.text.startswith(text)]
+    return found.verdict
+
+
+def changed(
+    figures: dict[str, list[dict[str, Any]]], names: tuple[str, ...], costs: dict[str, float]
+) -> dict[str, list[dict[str, Any]]]:
+    """The figures with other costs of some variants, by the first word that a variant begins with."""
+
+    def again(one: dict[str, Any]) -> dict[str, Any]:
+        run = Run(**{name: one[name] for name in Run.model_fields})
+        return row(
+            run, next((cost for name, cost in costs.items() if run.variant.startswith(name)), cost_of(run.variant))
+        )
+
+    return figures | {name: [again(one) for one in figures[name]] for name in names}
+
+
+def test_there_are_twenty_claims_or_more_and_each_is_said_once() -> None:
+    assert len(CLAIMS) >= 20
+    assert len({claim.text + claim.where for claim in CLAIMS}) == len(CLAIMS)
+
+
+def test_a_world_as_the_paper_has_it(figures: dict[str, list[dict[str, Any]]]) -> None:
+    for text in (
+        "Online SAC significantly",
+        "Diffusion-SAC achieves the highest return",
+        "Diffusion-SAC has the lowest age",
+        "BCQ < IQL, CQL < Diffusion-SAC",
+        "IQL and CQL perform comparably",
+        "alpha = 0, eta = .5 is the best",
+        "CQL over-constrains",
+        "Cloning alone",
+        "10 k rows are as good",
+        "More than 20 steps",
+        "lambda does not change",
+        "Fairness",
+    ):
+        assert verdict(figures, text) == HOLDS, text
+    for text in ("35 % more", "0.15 s to send", "Fewer than 10", "CQL, IQL and BCQ degrade", "A severely biased"):
+        assert verdict(figures, text) == FAILS, text
+    assert verdict(figures, "More than 0.65 GB") == READING
+
+
+def test_a_verdict_turns_with_what_was_measured(figures: dict[str, list[dict[str, Any]]]) -> None:
+    comparisons = ("comparison", "comparison-published", "comparison-paper")
+    worse = changed(figures, comparisons, {"CQL": 190.0})
+    assert verdict(worse, "Diffusion-SAC achieves the highest return") == FAILS
+    one_protocol = changed(figures, comparisons[:1], {"CQL": 190.0})
+    assert verdict(one_protocol, "Diffusion-SAC achieves the highest return") == READING
+    level = changed(figures, comparisons, {"CQL": 210.0})
+    assert verdict(level, "Diffusion-SAC achieves the highest return") == OPEN
+    fast = changed(figures, comparisons, {"CQL": 400.0, "IQL": 400.0, "BCQ": 400.0})
+    assert verdict(fast, "35 % more") == HOLDS
+    free = changed(figures, ("variants", "variants-published"), {"alpha = 1": 190.0})
+    assert verdict(free, "CQL over-constrains") == FAILS
+    few = changed(figures, ("denoising",), {"linear @ 2": 400.0, "vp @ 2": 400.0})
+    assert verdict(few, "Fewer than 10") == HOLDS
+    starved = changed(figures, ("biased",), {"Diffusion-SAC @ two": 400.0})
+    assert verdict(starved, "A severely biased") == HOLDS
+
+
+def test_a_figure_that_is_not_computed_leaves_its_claims_unsaid(figures: dict[str, list[dict[str, Any]]]) -> None:
+    some = {"comparison": figures["comparison"]}
+    assert verdict(some, "Online SAC significantly") == MISSING
+    assert verdict(some, "Diffusion-SAC achieves the highest return") == HOLDS
+    assert {finding.verdict for _, finding in judged(Results({}))} == {MISSING}
+
+
+def test_the_page_is_a_numbered_table(figures: dict[str, list[dict[str, Any]]]) -> None:
+    text = markdown(Results(figures), "How.")
+    rows = [line for line in text.splitlines() if line.startswith("| ") and line[2].isdigit()]
+    assert [line.split(" | ")[0] for line in rows] == [f"| {n}" for n in range(1, len(CLAIMS) + 1)]
+    assert all(line.count(" | ") == 5 for line in rows)
+    assert set(figures) == set(FIGURES)
