@@ -177,14 +177,16 @@ def _chosen(points: Sequence[Point], **wanted: Any) -> list[Point]:
 
 def _references(axes: Axes, points: Sequence[Point], metric: str, low: float, high: float) -> list[str]:
     """Dashed lines of what needs no learning, named at the right; those outside [low, high] are returned as text."""
-    outside = []
-    for point in _chosen(points, metric=metric, seeds=0):
-        if low <= point["mean"] <= high:
-            axes.axhline(point["mean"], color="#777777", linestyle=(0, (4, 2)), linewidth=0.8, zorder=1)
-            place: Any = {"xycoords": axes.get_yaxis_transform(), "fontsize": 6, "color": "#555555", "va": "bottom"}
-            axes.annotate(point["name"], (0.995, point["mean"]), ha="right", **place)
-        else:
-            outside.append(f"{point['name']} {point['mean']:.3g}")
+    outside, side, last = [], 1, None
+    for point in sorted(_chosen(points, metric=metric, seeds=0), key=lambda point: -point["mean"]):
+        if not low <= point["mean"] <= high:
+            outside.append(f"{point['name']} {point['mean']:,.4g}")
+            continue
+        near = last is not None and last - point["mean"] < 0.07 * (high - low)
+        side, last = 1 - side if near else 1, point["mean"]  # of two lines close together each has its own end
+        axes.axhline(point["mean"], color="#777777", linestyle=(0, (4, 2)), linewidth=0.8, zorder=1)
+        place: Any = {"xycoords": axes.get_yaxis_transform(), "fontsize": 6, "color": "#555555", "va": "bottom"}
+        axes.annotate(point["name"], (0.995 if side else 0.005, point["mean"]), ha="right" if side else "left", **place)
     return outside
 
 
@@ -329,7 +331,8 @@ def _columns(figure: Figure, points: Sequence[Point]) -> Canvas:
         limit = 3.0 * ordered[len(ordered) // 2] if ordered else 1.0
         for place, point in enumerate(chosen):
             colour = look[point["name"]][0] if point["name"] in look else "#999999"
-            axes.barh(place, min(point["mean"], limit), color=colour, height=0.7)
+            cut: Any = {"hatch": "////", "edgecolor": "white", "linewidth": 0.0} if point["mean"] > limit else {}
+            axes.barh(place, min(point["mean"], limit), color=colour, height=0.7, **cut)
             error = [[max(point["mean"] - point["low"], 0.0)], [max(point["high"] - point["mean"], 0.0)]]
             if point["seeds"] and point["mean"] <= limit:
                 axes.errorbar(point["mean"], place, xerr=error, color="black", capsize=1.5, linewidth=0.8)
@@ -339,6 +342,7 @@ def _columns(figure: Figure, points: Sequence[Point]) -> Canvas:
         axes.set_ylim(len(names) - 0.5, -0.5)
         axes.set_title(LABELS[metric], pad=8)
         axes.grid(axis="y", visible=False)
+    every[0].set_xlabel("hatched: the bar is cut", fontsize=6, color="#777777", loc="left")
     return canvas
 
 

@@ -26,6 +26,7 @@ Float = NDArray[np.float64]
 TIME_COLOURS = "viridis"  # safe for colour-blind readers, as the palette below (Okabe & Ito 2008)
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#222222")
 _DPI = 150
+_IN_A_ROW = 4  # flights of a figure of several
 _CUT = 5.0  # a bar this many times as long as the lower quartile is cut, or the others could not be compared
 _SMOOTH = 0.05  # share of a noisy curve that its running mean spans
 
@@ -218,7 +219,7 @@ def _short(name: str) -> str:
 
 
 def trajectories(episodes: Sequence[Episode], out: Path) -> None:
-    """Flights side by side, a panel each: devices, start (square), end (cross), the path coloured by time.
+    """Flights side by side, four in a row: devices, start (square), end (cross), the path coloured by time.
 
     Raises:
         ConfigError: no episode, or `out` cannot be written.
@@ -227,17 +228,24 @@ def trajectories(episodes: Sequence[Episode], out: Path) -> None:
         raise ConfigError("episodes is empty, needed: 1 or more")
     count = len(episodes)
     tallest = max(episode.scenario.area.depth_m / episode.scenario.area.width_m for episode in episodes)
+    columns = min(count, _IN_A_ROW)
+    rows = -(-count // columns)
     height_in = 1.2 + 3.9 * min(tallest, 1.5)
-    figure = Figure(figsize=(4.4 * count + 0.9, height_in), dpi=_DPI, layout="constrained")
-    panels = figure.subplots(1, count, squeeze=False, sharex=True, sharey=True)[0]
+    figure = Figure(figsize=(4.4 * columns + 0.9, height_in * rows), dpi=_DPI, layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
+    for axes in panels[count:]:
+        axes.set_visible(False)
+    panels = panels[:count]
     norm = Normalize(0.0, max(float(episode.time_s[-1]) for episode in episodes))
     for index, (axes, episode) in enumerate(zip(panels, episodes, strict=True)):
         draw_area(axes, episode.scenario)
         _dots(axes, episode, ["white"] * len(episode.layout_m), INK, 4.4 * 0.75)
         _path(axes, episode, norm)
         axes.set_title(f"{_short(episode.policy)}\nreturn {episode.total_reward:.4g}", fontsize=11)
-        if index:
+        if index % columns:
             axes.set_ylabel("")
+        if index + columns < count:
+            axes.set_xlabel("")
     figure.colorbar(ScalarMappable(norm, TIME_COLOURS), ax=list(panels), label="time (s)", shrink=0.85, pad=0.02)
     _save(figure, out)
 
