@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from tests.experiments.rows import cost_of, finished_figures, row
-from uavrl.experiments.claims import CLAIMS, FAILS, HOLDS, MISSING, OPEN, READING, Results, judged, markdown
+from uavrl.experiments.claims import CLAIMS, FAILS, HOLDS, MISSING, OPEN, READING, Results, counted, judged, table
 from uavrl.experiments.paper import FIGURES
 from uavrl.experiments.runner import Run
 
@@ -85,9 +85,10 @@ def test_a_figure_that_is_not_computed_leaves_its_claims_unsaid(figures: dict[st
     assert {finding.verdict for _, finding in judged(Results({}))} == {MISSING}
 
 
-def test_the_page_is_a_numbered_table(figures: dict[str, list[dict[str, Any]]]) -> None:
-    text = markdown(Results(figures), "How.")
-    rows = [line for line in text.splitlines() if line.startswith("| ") and line[2].isdigit()]
-    assert [line.split(" | ")[0] for line in rows] == [f"| {n}" for n in range(1, len(CLAIMS) + 1)]
-    assert all(line.count(" | ") == 5 for line in rows)
+def test_the_table_is_numbered_and_the_verdicts_counted(figures: dict[str, list[dict[str, Any]]]) -> None:
+    found = judged(Results(figures))
+    lines = table(found)
+    assert [line[0] for line in lines[1:]] == [str(number) for number in range(1, len(CLAIMS) + 1)]
+    assert all(len(line) == 6 and "|" not in "".join(line) for line in lines)
+    assert sum(int(part.split()[0]) for part in counted(found).split(", ")) == len(CLAIMS)
     assert set(figures) == set(FIGURES)

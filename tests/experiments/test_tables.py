@@ -6,7 +6,7 @@ import pytest
 from tests.experiments.rows import COST, PLAN, row
 from uavrl.evaluation.statistics import Interval
 from uavrl.experiments.paper import OURS, PROTOCOLS
-from uavrl.experiments.tables import compare, estimated, interval, markdown, scores
+from uavrl.experiments.tables import compare, estimated, interval, markdown, scores, table
 
 ROWS = [row(run) for run in PLAN.comparison(PROTOCOLS["layouts"])]
 
@@ -51,7 +51,7 @@ def test_what_a_flight_does_not_have_is_left_out_for_every_seed() -> None:
 def test_the_table_has_a_line_a_policy_and_says_who_diverged() -> None:
     rows = [dict(one) for one in ROWS]
     rows[-1]["scores"] = rows[-1]["scores"] | {"diverged": "q"}
-    text = markdown(rows)
+    text = markdown(table(rows))
     lines = [line.split(" | ")[0].removeprefix("| ") for line in text.splitlines()[2:]]
     assert lines == list(dict.fromkeys(one["variant"] for one in rows))
     assert "| BC | 2 (1 diverged) |" in text

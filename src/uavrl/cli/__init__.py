@@ -38,6 +38,7 @@ COMMANDS: dict[str, Command] = {
     "evaluate": Command("uavrl.cli.evaluate:Evaluate", "fly policies on equal layouts, starts and fading"),
     "export": Command("uavrl.cli.export:Export", "write a policy as one file that flies without torch"),
     "reproduce": Command("uavrl.cli.reproduce:Reproduce", "make the paper's figures and judge its claims"),
+    "report": Command("uavrl.cli.report:Report", "put what `uavrl reproduce` computed on one web page"),
     "ablate": Command("uavrl.cli.ablate:Ablate", "change one setting of Diffusion-SAC at a time and measure"),
     "bench simulate": Command(
         "uavrl.cli.bench:BenchSimulate", "measure environment steps a second, beside their floors"

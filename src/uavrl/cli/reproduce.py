@@ -57,4 +57,4 @@ class Reproduce:
         if not self.draw:
             with progress(f"reproduce {self.scale}", len(runs), "run") as report:
                 run_all(runs, measure, store, self.workers, report, self.cluster)
-        print("\n".join(write_results(figures, finished(store), self.out / self.scale)))
+        print("\n".join(write_results(figures, finished(store), self.out / self.scale, self.scale)))

@@ -318,7 +318,10 @@ def _fair(results: Results) -> Finding:
 def _stable(results: Results) -> Finding:
     spreads = {}
     for name in (OURS, *BASELINES):
-        spreads[name] = float(scores(results.groups("comparison")[name], "return").mean(axis=1).std(ddof=1))
+        means = scores(results.groups("comparison")[name], "return").mean(axis=1)
+        if len(means) < 3:
+            return Finding(f"{len(means)} training seeds", OPEN, "a spread over seeds needs three or more")
+        spreads[name] = float(means.std(ddof=1))
     text = "; ".join(f"{name} {value:.1f}" for name, value in spreads.items())
     verdict = HOLDS if spreads[OURS] <= min(spreads[name] for name in BASELINES) else FAILS
     return Finding(f"standard deviation of the final return over training seeds: {text}", verdict)
@@ -457,26 +460,18 @@ def judged(results: Results) -> list[tuple[Claim, Finding]]:
     return found
 
 
-def markdown(results: Results, about: str) -> str:
-    """CLAIMS.md."""
-    found = judged(results)
+def counted(found: Sequence[tuple[Claim, Finding]]) -> str:
+    """How many claims have each verdict."""
     counts = {verdict: sum(finding.verdict == verdict for _, finding in found) for verdict in _VERDICTS}
-    lines = [
-        "# The paper's claims",
-        "",
-        "Eldeeb & Alves, arXiv:2606.16331. "
-        + ", ".join(f"{count} {name}" for name, count in counts.items() if count)
-        + ".",
-        "",
-        about,
-        "",
-        "| | claim | where | measured | verdict | why |",
-        "|---|---|---|---|---|---|",
-    ]
+    return ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
+
+
+def table(found: Sequence[tuple[Claim, Finding]]) -> list[list[str]]:
+    """A header, then a line a claim, numbered."""
+    lines = [["", "claim", "where", "measured", "verdict", "why"]]
     for number, (claim, finding) in enumerate(found, start=1):
-        cells = (str(number), claim.text, claim.where, finding.measured, f"**{finding.verdict}**", finding.why)
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+        lines.append([str(number), claim.text, claim.where, finding.measured, finding.verdict, finding.why])
+    return lines
 
 
 _VERDICTS = (HOLDS, FAILS, READING, OPEN, MISSING)

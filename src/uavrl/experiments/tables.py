@@ -92,35 +92,42 @@ def estimated(values: Float, name: str = "") -> Estimate:
     return Estimate(environments.point, environments.replicates + (seeds.replicates - seeds.point))
 
 
-def markdown(rows: Sequence[Row], ours: str = OURS) -> str:
-    """A table of `compare`, with ages, energies and fairness beside it."""
-    header = (
+def table(rows: Sequence[Row], ours: str = OURS) -> list[list[str]]:
+    """`compare` in words: a header, then a line a variant."""
+    header = [
         "policy", "seeds", "return", "IQM", "over the planner, %", "0 TDM .. 100 planner", f"{ours} ahead by",
         f"P({ours} better)", "the other action", "age per step, s", "energy per step, J", "Jain 1/age",
         "worst device, s",
-    )  # fmt: skip
-    lines = ["| " + " | ".join(header) + " |", "|---" * len(header) + "|"]
-    groups = grouped(rows)
+    ]  # fmt: skip
+    lines, groups = [header], grouped(rows)
     for one in compare(rows, ours):
         means = [
             _mean(scores(groups[one.name], metric))
             for metric in ("age_per_step_s", "energy_per_step_j", "jain_age", "worst_device_age_s")
         ]
         seeds = f"{one.seeds}" if one.seeds else ""
-        cells = [
-            one.name,
-            seeds + (f" ({one.diverged} diverged)" if one.diverged else ""),
-            interval(one.returned, digits=0),
-            interval(one.middle, digits=0),
-            interval(one.excess, 100.0, digits=1),
-            interval(one.normalised, digits=0),
-            interval(one.ahead, digits=1, signed=True),
-            interval(one.improves, digits=2),
-            "" if one.other_return is None else f"{one.other_return:.0f}",
-            *means,
-        ]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+        lines.append(
+            [
+                one.name,
+                seeds + (f" ({one.diverged} diverged)" if one.diverged else ""),
+                interval(one.returned, digits=0),
+                interval(one.middle, digits=0),
+                interval(one.excess, 100.0, digits=1),
+                interval(one.normalised, digits=0),
+                interval(one.ahead, digits=1, signed=True),
+                interval(one.improves, digits=2),
+                "" if one.other_return is None else f"{one.other_return:.0f}",
+                *means,
+            ]
+        )
+    return lines
+
+
+def markdown(lines: Sequence[Sequence[str]]) -> str:
+    """A Markdown table of a header and lines."""
+    header, *rest = lines
+    text = ["| " + " | ".join(header) + " |", "|---" * len(header) + "|"]
+    return "\n".join([*text, *("| " + " | ".join(cells) + " |" for cells in rest)]) + "\n"
 
 
 def _mean(values: Float) -> str:
