@@ -48,6 +48,7 @@ class Results:
 
     def __init__(self, rows: Mapping[str, Sequence[Row]]) -> None:
         self.rows = rows
+        self._known: dict[tuple[str, str, str], Estimate] = {}  # many claims ask for the same
 
     def groups(self, figure: str) -> dict[str, list[Row]]:
         """Rows of a figure by variant.
@@ -61,7 +62,10 @@ class Results:
 
     def estimate(self, figure: str, variant: str, metric: str = "return") -> Estimate:
         """Mean of a metric over seeds and environments."""
-        return estimated(scores(self.groups(figure)[variant], metric), variant)
+        asked = (figure, variant, metric)
+        if asked not in self._known:
+            self._known[asked] = estimated(scores(self.groups(figure)[variant], metric), variant)
+        return self._known[asked]
 
     def ahead(self, figure: str, first: str, second: str, metric: str = "return", sign: float = 1.0) -> Interval:
         """sign x (first - second), paired over environments."""
@@ -91,7 +95,7 @@ def _beats(figure: str, metric: str, sign: float, others: Sequence[str], unit: s
     def judge(results: Results) -> Finding:
         ahead = {name: results.ahead(figure, OURS, name, metric, sign) for name in others}
         return Finding(
-            f"{PROTOCOLS[_protocol(figure)].title}: ahead of {_listed(ahead)}{unit}", _verdict([*ahead.values()])
+            f"{PROTOCOLS[_protocol(figure)].name}: ahead of {_listed(ahead)}{unit}", _verdict([*ahead.values()])
         )
 
     return judge
@@ -127,7 +131,7 @@ def _order(figure: str) -> Callable[[Results], Finding]:
             f"{OURS} over IQL": results.ahead(figure, OURS, "IQL"),
             f"{OURS} over CQL": results.ahead(figure, OURS, "CQL"),
         }
-        return Finding(f"{PROTOCOLS[_protocol(figure)].title}: {_listed(steps)}", _verdict([*steps.values()]))
+        return Finding(f"{PROTOCOLS[_protocol(figure)].name}: {_listed(steps)}", _verdict([*steps.values()]))
 
     return judge
 
@@ -140,7 +144,7 @@ def _comparable(figure: str, first: str, second: str) -> Callable[[Results], Fin
         else:
             verdict = FAILS if min(abs(apart.low), abs(apart.high)) > NEAR and apart.low * apart.high > 0 else OPEN
         return Finding(
-            f"{PROTOCOLS[_protocol(figure)].title}: {first} costs {_percent(apart)} more than {second}", verdict
+            f"{PROTOCOLS[_protocol(figure)].name}: {first} costs {_percent(apart)} more than {second}", verdict
         )
 
     return judge
@@ -155,7 +159,7 @@ def _throughput(figure: str) -> Callable[[Results], Finding]:
         more = {name: results.ratio(figure, OURS, name, "throughput_mbps") for name in BASELINES}
         text = "; ".join(f"{_percent(one)} against {name}" for name, one in more.items())
         clear = _verdict([Interval(*(value - 0.35 for value in one)) for one in more.values()])
-        return Finding(f"{PROTOCOLS[_protocol(figure)].title}: throughput {text}", clear)
+        return Finding(f"{PROTOCOLS[_protocol(figure)].name}: throughput {text}", clear)
 
     return judge
 
@@ -166,7 +170,7 @@ def _packet(figure: str) -> Callable[[Results], Finding]:
         mean = results.estimate(figure, OURS, "transmission_mean_s").interval()
         verdict = HOLDS if median.low <= 0.155 else FAILS
         text = f"median {interval(median, digits=3)} s, mean {interval(mean, digits=3)} s a packet"
-        return Finding(f"{PROTOCOLS[_protocol(figure)].title}: {text}", verdict)
+        return Finding(f"{PROTOCOLS[_protocol(figure)].name}: {text}", verdict)
 
     return judge
 
@@ -195,7 +199,7 @@ def _sizes(figure: str, protocol: str, names: Sequence[str], near: bool) -> Call
             verdict = HOLDS if high <= NEAR else FAILS if low > NEAR else OPEN
         else:
             verdict = _verdict([Interval(*(value - NEAR for value in one)) for one in worse.values()])
-        return Finding(f"{PROTOCOLS[protocol].title}: cost with {small} rows over that with {large}: {text}", verdict)
+        return Finding(f"{PROTOCOLS[protocol].name}: cost with {small} rows over that with {large}: {text}", verdict)
 
     return judge
 
@@ -226,7 +230,7 @@ def _variant(figure: str, best: str, metric: str = "return", sign: float = 1.0) 
 
 
 def _where(figure: str) -> str:
-    return PROTOCOLS["published" if figure.endswith("published") else "layouts"].title
+    return PROTOCOLS["published" if figure.endswith("published") else "layouts"].name
 
 
 def _penalty(figure: str) -> Callable[[Results], Finding]:

@@ -64,6 +64,7 @@ SCALES = {
 class Protocol(NamedTuple):
     """Where algorithms meet: scenario, layouts, data, and whose settings they bring."""
 
+    name: str  # as claims call it
     title: str
     scenario: Scenario
     layouts: Literal["fixed", "random"]
@@ -79,6 +80,7 @@ class Protocol(NamedTuple):
 
 PROTOCOLS = {
     "layouts": Protocol(
+        "unseen layouts",
         "unseen layouts, set network, our settings, scenario released",
         load_scenario("released"),
         "random",
@@ -86,6 +88,7 @@ PROTOCOLS = {
         "default",
     ),
     "published": Protocol(
+        "as published",
         "one layout, the paper's perceptron and settings, scenario released",
         load_scenario("released"),
         "fixed",
@@ -93,6 +96,7 @@ PROTOCOLS = {
         "paper",
     ),
     "paper-objective": Protocol(
+        "scenario paper",
         "unseen layouts, set network, our settings, scenario paper",
         load_scenario("paper"),
         "random",

@@ -14,7 +14,7 @@ from plotly.offline import get_plotlyjs
 from uavrl.evaluation.episode import Episode
 from uavrl.evaluation.report import write_text
 from uavrl.experiments import claims, plots, tables
-from uavrl.experiments.paper import FIGURES
+from uavrl.experiments.paper import FIGURES, PROTOCOLS
 from uavrl.experiments.runner import Run
 from uavrl.viewer.page import episode_figure
 
@@ -84,7 +84,8 @@ def write_results(figures: Mapping[str, Sequence[Run]], rows: Mapping[str, Row],
 
 def about(scale: str) -> str:
     """How claims are judged."""
-    return ABOUT.format(scale=scale) + (SMOKE if scale == "smoke" else "")
+    readings = "; ".join(f"{protocol.name}: {protocol.title}" for protocol in PROTOCOLS.values())
+    return f"{ABOUT.format(scale=scale)} Readings: {readings}." + (SMOKE if scale == "smoke" else "")
 
 
 def made(rows: Sequence[Row], missing: int) -> str:
@@ -128,7 +129,7 @@ def report_page(
         _contents(["Claims", *(FIGURES[name].title for name in done), *(["Flights"] if episodes else [])]),
         _heading("Claims"),
         f"<p>{_words(about(scale))}</p>",
-        _table(claims.table(found)),
+        _table(claims.table(found), "claims"),
     ]
     for name, own in done.items():
         picture = base64.b64encode((drawn / f"{name}.png").read_bytes()).decode()
@@ -172,11 +173,11 @@ def _words(text: str) -> str:
     return escape(text).replace("**", "").replace("`", "")
 
 
-def _table(lines: Sequence[Sequence[str]]) -> str:
+def _table(lines: Sequence[Sequence[str]], kind: str = "numbers") -> str:
     header, *rest = lines
     head = "".join(f"<th>{escape(cell)}</th>" for cell in header)
     body = "".join("<tr>" + "".join(_cell(cell) for cell in cells) + "</tr>" for cells in rest)
-    return f"<div class='wide'><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
+    return f"<div class='wide'><table class='{kind}'><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
 
 
 def _cell(text: str) -> str:
@@ -200,7 +201,7 @@ _PAGE = """<!DOCTYPE html>
   .flight {{ min-width: 900px; height: 640px; }}
   table {{ border-collapse: collapse; font-size: 13px; margin: 12px 0; }}
   th, td {{ border-bottom: 1px solid #ddd; padding: 4px 8px; text-align: left; vertical-align: top; }}
-  td {{ min-width: 2em; }}
+  td:not(:first-child) {{ min-width: 4.5em; }} .claims td:nth-child(4) {{ min-width: 20em; }}
   .holds {{ color: #00684c; font-weight: bold; }} .fails {{ color: #a33c00; font-weight: bold; }}
   .reading {{ color: #6b5200; font-weight: bold; }}
   .made {{ color: #555; font-size: 13px; }}
