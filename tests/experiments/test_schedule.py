@@ -23,4 +23,4 @@ def test_what_is_left_is_estimated_from_finished_runs_of_its_kind() -> None:
     known = {runs[0].key: row(runs[0]) | {"seconds": 3_600.0}}
     table, _ = schedule({"comparison": runs}, known, 2)
     assert "about 4.0 core-hours left, 2.0 hours with 2 workers" in str(table.caption)
-    assert estimated_s(runs[0]) == pytest.approx(4_000 * 0.08, rel=0.6)
+    assert estimated_s(runs[0]) == pytest.approx(4_000 * 0.14, rel=0.1)

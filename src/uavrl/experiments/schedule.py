@@ -18,10 +18,11 @@ Row = Mapping[str, Any]
 _UPDATE_S = {
     ("diffusion_sac", "devices"): 0.08,
     ("diffusion_sac", "mlp"): 0.14,
-    ("cql", "devices"): 0.08,
-    ("bcq", "devices"): 0.08,
+    ("cql", "devices"): 0.14,
+    ("bcq", "devices"): 0.14,
+    ("iql", "devices"): 0.06,
 }
-_OTHER_UPDATE_S = 0.04
+_OTHER_UPDATE_S = 0.02
 _FLIGHT_S = 2.0  # of an online learner
 _FLOWN_S = 0.006  # a flight of 400 steps of the evaluation, learned policies
 _PLANNED_S = 0.4  # and the planner's
