@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 import time
 from pathlib import Path
@@ -76,3 +77,12 @@ def test_a_cluster_that_does_not_answer_is_named(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(ray, "init", refuses)
     with pytest.raises(ConfigError, match=r"--cluster 'auto' does not answer: Could not find any running Ray instance"):
         run_all(wanted(1), steps_with_checkpoints, tmp_path / "rows.jsonl", 1, lambda done, text: None, "auto")
+
+
+def test_an_address_where_nobody_listens_is_named_at_once(tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))  # bound, but nobody listens
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(ConfigError, match=f"--cluster '{address}' does not answer: .*refused"):
+            run_all(wanted(1), steps_with_checkpoints, tmp_path / "rows.jsonl", 1, lambda done, text: None, address)

@@ -11,6 +11,7 @@ import json
 import multiprocessing
 import os
 import shutil
+import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -26,6 +27,7 @@ from uavrl.training.log import Reporter
 
 Scores = dict[str, Any]  # of one run, JSON
 
+_ANSWER_S = 10.0  # within which a cluster must answer
 RETRIES = 10  # of a run whose worker or node is lost
 
 
@@ -122,9 +124,12 @@ def _on_cluster(places: Sequence[tuple[Run, Path]], function: Function, address:
         import ray
     except ImportError:
         raise ConfigError("--cluster needs Ray, install it: pip install 'uavrl[cluster]'") from None
+    host, _, port = address.rpartition(":")
     try:
+        if host and port.isdigit():  # Ray itself would try for minutes
+            socket.create_connection((host, int(port)), timeout=_ANSWER_S).close()
         ray.init(address=address, log_to_driver=False, logging_level="ERROR")
-    except (ConnectionError, RuntimeError, ValueError) as error:
+    except (OSError, RuntimeError, ValueError) as error:
         raise ConfigError(f"--cluster '{address}' does not answer: {str(error).splitlines()[0]}") from None
     try:
         task = ray.remote(num_cpus=1, max_retries=RETRIES)(_timed)
