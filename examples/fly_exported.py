@@ -1,4 +1,7 @@
-"""Fly an exported policy: `uavrl export RUN -o policy.onnx`, then `python examples/fly_exported.py policy.onnx`."""
+"""Fly an exported policy: `uavrl export pretrained:layouts -o policy.onnx`.
+
+Then `python examples/fly_exported.py policy.onnx`.
+"""
 
 from __future__ import annotations
 
