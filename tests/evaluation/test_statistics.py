@@ -13,6 +13,7 @@ from uavrl.evaluation.statistics import (
     excess_cost,
     interquartile_mean,
     normalised_return,
+    over_seeds,
     probability_of_improvement,
     resampling,
     run_mean,
@@ -124,6 +125,12 @@ def test_interquartile_mean_resamples_whole_runs() -> None:
     two = np.array([[0.0], [1.0]])  # every resample is one of four
     expected = {float(np.mean(pair)) for pair in itertools.product((0.0, 1.0), repeat=2)}
     assert {*interquartile_mean(two, seed=0)} <= expected
+
+
+def test_an_interval_over_seeds_by_hand() -> None:
+    assert over_seeds([1.0]) == (1.0, 1.0, 1.0)
+    assert over_seeds([1.0, 3.0]) == (2.0, 1.0, 3.0)
+    assert over_seeds([1.0, 2.0, 3.0]) == pytest.approx((2.0, 2.0 - 4.3027 / 3**0.5, 2.0 + 4.3027 / 3**0.5), abs=1e-4)
 
 
 def test_the_mean_of_runs_spreads_as_their_number_says() -> None:

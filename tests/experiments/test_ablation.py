@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from uavrl.agents.diffusion_sac import DiffusionSacConfig
-from uavrl.agents.registry import preset
+from uavrl.agents.registry import changed, preset
 from uavrl.experiments import ablation
-from uavrl.experiments.ablation import BASE, BASES, CANDIDATES, VARIANTS, changed, measure, runs, summary, table
+from uavrl.experiments.ablation import BASE, BASES, CANDIDATES, VARIANTS, measure, runs, summary, table
 from uavrl.experiments.runner import Run
 from uavrl.scenario import load_scenario
 
@@ -84,5 +84,5 @@ def test_the_table_has_a_line_a_variant_and_one_for_each_number_of_candidates() 
 
 
 def test_the_interval_is_students() -> None:
-    assert summary(np.array([1.0, 2.0, 3.0])) == "2.000 ± 2.484"  # 4.3027 / sqrt(3)
-    assert summary(np.array([-100.0, -200.0, -300.0])) == "-200 ± 248"
+    assert summary([1.0, 2.0, 3.0]) == "2.000 ± 2.484"  # 4.3027 / sqrt(3)
+    assert summary([-100.0, -200.0, -300.0]) == "-200 ± 248"

@@ -8,7 +8,7 @@ from PIL import Image
 
 from tests.experiments.rows import finished_figures
 from uavrl.experiments.paper import FIGURES
-from uavrl.experiments.plots import draw, numbers, spread
+from uavrl.experiments.plots import draw, numbers
 
 
 @pytest.mark.parametrize("name", list(FIGURES))
@@ -32,13 +32,6 @@ def test_equal_numbers_make_equal_files(tmp_path: Path) -> None:
         draw("comparison", rows, tmp_path / place)
     for suffix in ("png", "pdf", "csv"):
         assert (tmp_path / f"a/comparison.{suffix}").read_bytes() == (tmp_path / f"b/comparison.{suffix}").read_bytes()
-
-
-def test_a_spread_over_seeds_by_hand() -> None:
-    assert spread([1.0]) == (1.0, 1.0, 1.0)
-    assert spread([1.0, 3.0]) == (2.0, 1.0, 3.0)
-    mean, low, high = spread([1.0, 2.0, 3.0])
-    assert (mean, low, high) == pytest.approx((2.0, 2.0 - 4.303 / 3**0.5, 2.0 + 4.303 / 3**0.5), abs=1e-3)
 
 
 def test_a_curve_is_the_mean_over_seeds_at_each_point() -> None:

@@ -65,3 +65,4 @@ def test_rows_hold_the_whole_run(tmp_path: Path) -> None:
     row = json.loads(store.read_text())
     assert {name: row[name] for name in Run.model_fields} == run.model_dump()
     assert row["seconds"] >= 0
+    assert row["machine"]["threads"] == 1  # of the process that computed it

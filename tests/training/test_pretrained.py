@@ -10,6 +10,7 @@ from uavrl.cli import main
 from uavrl.datasets import load_builtin
 from uavrl.errors import CheckpointError
 from uavrl.evaluation.rollouts import evaluation_set, fly
+from uavrl.policies import make_policy
 from uavrl.scenario import load_scenario
 from uavrl.training.checkpoint import checkpoint_in, load_checkpoint, pretrained, pretrained_names
 from uavrl.training.offline import OfflineLearner, TrainConfig
@@ -58,8 +59,6 @@ def test_an_installed_policy_is_small_has_a_card_and_beats_tdm_on_trial_flights(
         assert f"## {heading}" in card
     scenario = load_scenario("released")
     tests = evaluation_set(scenario, "fixed" if name == "fixed" else "random", 10, seed=500_000)
-    from uavrl.policies import make_policy
-
     flown = {
         policy.name: fly(policy, tests, deterministic=True)
         for policy in (load_policy(place, scenario), make_policy("tdm"))

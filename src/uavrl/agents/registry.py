@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Annotated, Any
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, TypeVar
 
 from pydantic import Field
 
@@ -23,6 +23,8 @@ from uavrl.networks import NetworkConfig, Spaces
 Offline = DiffusionSacConfig | CqlConfig | IqlConfig | BcqConfig | BcConfig | GaussianBcConfig | OneStepConfig
 OfflineConfig = Annotated[Offline, Field(discriminator="name")]
 AnyConfig = Annotated[Offline | SacConfig, Field(discriminator="name")]
+
+Config = TypeVar("Config", bound=AgentConfig)
 
 AGENTS: dict[type[AgentConfig], Callable[[Spaces, Any], Agent]] = {
     DiffusionSacConfig: DiffusionSac,
@@ -124,6 +126,14 @@ def preset(agent: str, name: str) -> Offline:
     if name not in PRESETS[known]:
         raise ConfigError(f"preset = {name!r} of {agent}, allowed: {', '.join(PRESETS[known])}")
     return PRESETS[known][name]
+
+
+def changed(config: Config, changes: Mapping[str, Any]) -> Config:
+    """The configuration with settings changed, those of a section by a dict of their own; validated."""
+    data = config.model_dump()
+    for name, value in changes.items():
+        data[name] = data[name] | value if isinstance(value, dict) else value
+    return type(config).model_validate(data)
 
 
 def make_agent(spaces: Spaces, config: AgentConfig) -> Agent:

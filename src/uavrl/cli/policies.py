@@ -25,11 +25,13 @@ def resolve(spec: str, scenario: Scenario) -> Policy:
     """
     if spec in POLICIES:
         return make_policy(spec)
-    if Path(spec).is_dir() or spec.startswith("pretrained:"):
+    installed = spec.startswith("pretrained:")
+    if installed or Path(spec).is_dir():
         from uavrl.training.policy import load_policy  # here: torch is slow to import
 
         policy = load_policy(Path(spec), scenario)
-        policy.name = spec if spec.startswith("pretrained:") else policy.name
+        if installed:
+            policy.name = spec
         return policy
     if spec.endswith(".onnx"):
         if find_spec("onnxruntime") is None:

@@ -47,13 +47,13 @@ class Reproduce:
         from uavrl.experiments.schedule import schedule
         from uavrl.training.log import progress
 
-        output_directory(self.out)
         store = self.out / f"{self.scale}.jsonl"
         figures = wanted(SCALES[self.scale], self.figure or tuple(FIGURES))
         table, runs = schedule(figures, finished(store), self.workers)
         Console(width=None, highlight=False).print(table)
         if self.plan:
             return
+        output_directory(self.out)
         if not self.draw:
             with progress(f"reproduce {self.scale}", len(runs), "run") as report:
                 run_all(runs, measure, store, self.workers, report, self.cluster)

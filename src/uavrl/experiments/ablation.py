@@ -6,15 +6,13 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from scipy.stats import t
 
 from uavrl.agents.diffusion_sac import DiffusionSac, DiffusionSacConfig
-from uavrl.agents.registry import preset
+from uavrl.agents.registry import changed, preset
 from uavrl.datasets import load_builtin
 from uavrl.evaluation.rollouts import TRIAL_SEED, evaluation_set, fly
+from uavrl.evaluation.statistics import over_seeds
 from uavrl.experiments.bandit import SPACES, HybridBandit, fit_bandit, samples
 from uavrl.experiments.runner import Run, Scores
 from uavrl.networks import NetworkConfig
@@ -76,14 +74,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "Bellman error linear from 1 on": {"huber": 1.0},
 }
 CANDIDATES = (10, 50)  # of the base policy, beside its single one: nothing is trained anew for them
-
-
-def changed(base: DiffusionSacConfig, changes: dict[str, Any]) -> DiffusionSacConfig:
-    """The configuration with nested changes applied, validated."""
-    data = base.model_dump()
-    for name, value in changes.items():
-        data[name] = data[name] | value if isinstance(value, dict) else value
-    return DiffusionSacConfig.model_validate(data)
 
 
 def runs(problem: str, seeds: Sequence[int], variants: Iterable[str] = VARIANTS) -> list[Run]:
@@ -159,16 +149,16 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     columns = list(dict.fromkeys(column for scores in lines.values() for column in scores))
     text = [f"| variant | seeds | {' | '.join(columns)} |", "|---" * (2 + len(columns)) + "|"]
     for variant, scores in lines.items():
-        cells = [summary(np.array(scores[column])) if column in scores else "" for column in columns]
+        cells = [summary(scores[column]) if column in scores else "" for column in columns]
         name = variant.replace("|", r"\|")  # as in |Q|
         text.append(f"| {name} | {max(map(len, scores.values()))} | {' | '.join(cells)} |")
     return "\n".join(text) + "\n"
 
 
-def summary(values: NDArray[np.float64]) -> str:
+def summary(values: Sequence[float]) -> str:
     """Mean ± half of the 95 % t interval; of two values, both; of one, itself."""
-    digits = 0 if np.abs(values).max() > 10 else 3
+    digits = 0 if max(map(abs, values)) > 10 else 3
     if len(values) > 2:
-        half = float(t.ppf(0.975, len(values) - 1)) * values.std(ddof=1) / len(values) ** 0.5
-        return f"{values.mean():.{digits}f} ± {half:.{digits}f}"
+        mean, _, high = over_seeds(values)
+        return f"{mean:.{digits}f} ± {high - mean:.{digits}f}"
     return ", ".join(f"{value:.{digits}f}" for value in values)

@@ -7,16 +7,14 @@ claim's side, does not hold where it is clear on the other one, and is open wher
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from uavrl.evaluation.statistics import Estimate, Interval, combine
 from uavrl.experiments.paper import ONLINE, OURS, PROTOCOLS
-from uavrl.experiments.plots import grouped, spread
+from uavrl.experiments.runner import Row, grouped
 from uavrl.experiments.tables import estimated, interval, scores
-
-Row = Mapping[str, Any]
 
 HOLDS, FAILS, OPEN, READING, MISSING = "holds", "does not hold", "open", "depends on the reading", "not measured yet"
 BASELINES = ("CQL", "IQL", "BCQ")
@@ -275,12 +273,17 @@ def _steps(few: bool) -> Callable[[Results], Finding]:
     return judge
 
 
+def _decision_ms(rows: Sequence[Row]) -> float:
+    """Mean over seeds."""
+    return float(np.mean([row["scores"]["decision_ms"] for row in rows]))
+
+
 def _linear_time(results: Results) -> Finding:
     groups = results.groups("denoising")
     pairs = []
     for name, rows in groups.items():
         if name.startswith("vp @ "):
-            pairs.append((int(name.split(" @ ")[1]), float(np.mean([row["scores"]["decision_ms"] for row in rows]))))
+            pairs.append((int(name.split(" @ ")[1]), _decision_ms(rows)))
     steps, times = np.array(sorted(pairs)).T
     slope, offset = np.polyfit(steps, times, 1)
     error = float(np.abs(slope * steps + offset - times).max() / times.max())
@@ -294,7 +297,7 @@ def _times(results: Results) -> Finding:
     steps = sorted(int(name.split(" @ ")[1]) for name in groups if name.startswith("vp @ "))
     enough = next((count for count in steps if count >= 20), steps[-1])  # "more than 20 steps"
     named = {**{name: name for name in BASELINES}, f"{OURS}, M = {enough}": f"vp @ {enough}"}
-    times = {label: spread(row["scores"]["decision_ms"] for row in groups[name]).mean for label, name in named.items()}
+    times = {label: _decision_ms(groups[name]) for label, name in named.items()}
     text = ", ".join(f"{label} {value:.2f} ms" for label, value in times.items())
     return Finding(text, READING, "theirs are of a V100, these of one CPU core; on either, M passes cost M times one")
 

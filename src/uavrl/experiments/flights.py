@@ -5,7 +5,6 @@ Everything a run depends on is in its `Run`; what comes back is small enough to 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,7 +19,7 @@ from uavrl.errors import DivergenceError
 from uavrl.evaluation.metrics import flight_metrics
 from uavrl.evaluation.rollouts import EVALUATION_SEED, EvaluationSet, evaluation_set, fly
 from uavrl.evaluation.statistics import unit_means
-from uavrl.experiments.runner import Run, Scores
+from uavrl.experiments.runner import Row, Run, Scores
 from uavrl.policies import make_policy
 from uavrl.policies.base import Policy
 from uavrl.scenario import Scenario
@@ -185,6 +184,6 @@ def _short(values: NDArray[Any]) -> list[float | None]:
     return [float(f"{value:.{DIGITS}g}") if np.isfinite(value) else None for value in values]
 
 
-def flown(row: Mapping[str, Any], metric: str) -> NDArray[np.float64]:
+def flown(row: Row, metric: str) -> NDArray[np.float64]:
     """A metric of every environment of a finished run, (E,)."""
     return np.array(row["scores"]["flown"][metric], dtype=np.float64)

@@ -6,11 +6,11 @@ say about the paper's sentences in `claims`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-from uavrl.agents.registry import AGENTS, Offline, preset
+from uavrl.agents.registry import AGENTS, changed, preset
 from uavrl.agents.sac import SacConfig
 from uavrl.experiments.flights import Data, Setting
 from uavrl.experiments.runner import Run
@@ -18,9 +18,14 @@ from uavrl.scenario import Scenario, load_scenario
 
 OURS = "Diffusion-SAC"
 ALGORITHMS = {OURS: "diffusion_sac", "CQL": "cql", "IQL": "iql", "BCQ": "bcq", "BC": "bc"}
-PAPER_HEURISTICS = {"TDM": "tdm", "Saver": "saver", "random walk": "random_walk"}
-REFERENCES = {**PAPER_HEURISTICS, "index at best hover": "hover", "planner": "planner"}
 YARDSTICK, ROUND_ROBIN = "planner", "TDM"
+REFERENCES = {
+    ROUND_ROBIN: "tdm",
+    "Saver": "saver",
+    "random walk": "random_walk",
+    "index at best hover": "hover",
+    YARDSTICK: "planner",
+}
 ONLINE = "online SAC"
 
 
@@ -109,14 +114,6 @@ _CHEAPER = {"BCQ": {"candidates": 10}}
 STARVED = (1, 2)  # devices whose services the biased log lacks
 
 
-def _merged(config: Offline, changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings as JSON, with nested changes."""
-    data = config.model_dump()
-    for name, value in changes.items():
-        data[name] = data[name] | value if isinstance(value, dict) else value
-    return type(config).model_validate(data).model_dump(mode="json")
-
-
 class Plan:
     """The runs of one scale."""
 
@@ -144,7 +141,7 @@ class Plan:
             data: fields of `Data` that differ from 30,000 mixed rows of the protocol's log.
         """
         every = _CHEAPER.get(algorithm, {}) | dict(changes or {})
-        settings = _merged(preset(ALGORITHMS[algorithm], protocol.preset), every)
+        settings = changed(preset(ALGORITHMS[algorithm], protocol.preset), every).model_dump(mode="json")
         published = protocol.preset == "paper"
         rows = Data(**{"name": protocol.data, "size": self.size, **(data or {})})
         options = self._setting(protocol, rows, protocol.deterministic(algorithm))
@@ -180,12 +177,12 @@ class Plan:
             points=self.scale.points,
         ).model_dump(mode="json")
 
-    def references(self, protocol: Protocol, names: Mapping[str, str] = REFERENCES) -> list[Run]:
+    def references(self, protocol: Protocol) -> list[Run]:
         """What needs no learning, in the same environments."""
         options = self._setting(protocol)
         return [
             Run(problem="policy", variant=name, settings={"policy": policy}, updates=0, seed=0, options=options)
-            for name, policy in names.items()
+            for name, policy in REFERENCES.items()
         ]
 
     def online(self) -> list[Run]:
@@ -306,7 +303,7 @@ FIGURES: dict[str, Figure] = {
 }
 
 
-def wanted(scale: Scale, figures: Iterator[str] | tuple[str, ...] = tuple(FIGURES)) -> dict[str, list[Run]]:
+def wanted(scale: Scale, figures: Iterable[str] = tuple(FIGURES)) -> dict[str, list[Run]]:
     """Each figure's runs."""
     plan = Plan(scale)
     return {name: FIGURES[name].runs(plan) for name in figures}

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
-from scipy.stats import t
 
 from uavrl.evaluation.report import write_text
+from uavrl.evaluation.statistics import over_seeds
 from uavrl.experiments.flights import SHOWN, flown
-from uavrl.experiments.paper import ALGORITHMS, FIGURES, ONLINE, Figure
+from uavrl.experiments.paper import ALGORITHMS, FIGURES, ONLINE, ROUND_ROBIN, YARDSTICK, Figure
+from uavrl.experiments.runner import Row, grouped
 
-Row = Mapping[str, Any]  # of the store
 Point = dict[str, Any]  # of the CSV
 
 LABELS = {
@@ -61,32 +61,6 @@ _WIDTH_IN = 7.16  # two columns of the usual journals
 _DPI = 220
 
 
-class Spread(NamedTuple):
-    """Mean over training seeds with its 95 % interval."""
-
-    mean: float
-    low: float
-    high: float
-
-
-def spread(values: Iterable[float]) -> Spread:
-    """t interval of the mean over three seeds or more; of two the two values, of one itself."""
-    numbers = np.array(list(values), dtype=np.float64)
-    mean = float(numbers.mean())
-    if len(numbers) < 3:
-        return Spread(mean, float(numbers.min()), float(numbers.max()))
-    half = float(t.ppf(0.975, len(numbers) - 1)) * float(numbers.std(ddof=1)) / len(numbers) ** 0.5
-    return Spread(mean, mean - half, mean + half)
-
-
-def grouped(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Rows by variant, in their order; each holds a variant's seeds."""
-    groups: dict[str, list[Row]] = {}
-    for row in rows:
-        groups.setdefault(row["variant"], []).append(row)
-    return groups
-
-
 def _metric(row: Row, name: str) -> float:
     if name == "decision_ms":
         return float(row["scores"]["decision_ms"])
@@ -120,7 +94,7 @@ def _over_updates(seeds: Sequence[Row], metric: str) -> Iterable[tuple[float, li
 
 def _point(name: str, at: Any, metric: str, values: list[float], seeds: Sequence[Row]) -> Point:
     learned = seeds[0]["problem"] != "policy"
-    return {"name": name, "at": at, "metric": metric} | spread(values)._asdict() | {"seeds": len(seeds) * learned}
+    return {"name": name, "at": at, "metric": metric} | over_seeds(values)._asdict() | {"seeds": len(seeds) * learned}
 
 
 def draw(name: str, rows: Sequence[Row], out: Path) -> list[Path]:
@@ -176,7 +150,7 @@ def _chosen(points: Sequence[Point], **wanted: Any) -> list[Point]:
 
 
 def _references(axes: Axes, points: Sequence[Point], metric: str, low: float, high: float) -> list[str]:
-    """Dashed lines of what needs no learning, named at the right; those outside [low, high] are returned as text."""
+    """Dashed lines of what needs no learning, named at an end; those outside [low, high] are returned as text."""
     outside, side, last = [], 1, None
     for point in sorted(_chosen(points, metric=metric, seeds=0), key=lambda point: -point["mean"]):
         if not low <= point["mean"] <= high:
@@ -209,7 +183,7 @@ def _curves(figure: Figure, points: Sequence[Point]) -> Canvas:
     look = _look(names)
     for axes, metric in zip(every, SHOWN, strict=True):
         ends = [point for point in _chosen(points, metric=metric, at="final") if point["seeds"]]
-        shown = [p["mean"] for p in _chosen(points, metric=metric, seeds=0) if p["name"] in ("TDM", "planner")]
+        shown = _spanned(_chosen(points, metric=metric))
         late = [p for p in points if p["metric"] == metric and p["seeds"] and p["at"] != "final"]
         half = 0.4 * max((p["at"] for p in late), default=0)
         low, high = _limits([*ends, *(p for p in late if p["at"] > half)], shown)
@@ -227,6 +201,11 @@ def _curves(figure: Figure, points: Sequence[Point]) -> Canvas:
     return canvas
 
 
+def _spanned(points: Sequence[Point]) -> list[float]:
+    """Of what needs no learning, the means that an axis has room for in any case."""
+    return [p["mean"] for p in points if not p["seeds"] and p["name"] in (ROUND_ROBIN, YARDSTICK)]
+
+
 def _legend(canvas: Canvas, axes: Axes, count: int) -> None:
     handles, labels = axes.get_legend_handles_labels()
     canvas.legend(handles, labels, loc="outside upper center", ncols=min(count, 7), frameon=False, handlelength=1.6)
@@ -240,7 +219,7 @@ def _lines(figure: Figure, points: Sequence[Point]) -> Canvas:
     for axes, metric in zip(every, metrics, strict=True):
         own = [point for point in points if point["metric"] == metric and point["seeds"]]
         swept = [point for point in own if point["at"]]
-        references = [p["mean"] for p in _chosen(points, metric=metric, seeds=0) if p["name"] in ("TDM", "planner")]
+        references = _spanned(_chosen(points, metric=metric))
         low, high = _limits(own, references if metric == "return" else [0.0])
         for name in names:
             line = [point for point in swept if point["name"] == name]
@@ -274,7 +253,7 @@ def _bars(figure: Figure, points: Sequence[Point]) -> Canvas:
     look = _look(names)
     own = [point for point in points if point["seeds"]]
     places = list(dict.fromkeys(point["at"] for point in own))
-    references = [p["mean"] for p in points if not p["seeds"] and p["name"] in ("TDM", "planner")]
+    references = _spanned(points)
     # the worst may be far below: what is compared are the others
     low, high = _limits([p for p in own if p["mean"] > 4 * max(q["mean"] for q in own)], references)
     width = 0.8 / len(names)
@@ -342,7 +321,8 @@ def _columns(figure: Figure, points: Sequence[Point]) -> Canvas:
         axes.set_ylim(len(names) - 0.5, -0.5)
         axes.set_title(LABELS[metric], pad=8)
         axes.grid(axis="y", visible=False)
-    every[0].set_xlabel("hatched: the bar is cut", fontsize=6, color="#777777", loc="left")
+    if any(bar.get_hatch() for axes in every for bar in axes.patches):
+        every[0].set_xlabel("hatched: the bar is cut", fontsize=6, color="#777777", loc="left")
     return canvas
 
 

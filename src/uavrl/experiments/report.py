@@ -6,7 +6,6 @@ import base64
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import Any
 
 import plotly.io
 from plotly.offline import get_plotlyjs
@@ -15,10 +14,8 @@ from uavrl.evaluation.episode import Episode
 from uavrl.evaluation.report import write_text
 from uavrl.experiments import claims, plots, tables
 from uavrl.experiments.paper import FIGURES, PROTOCOLS
-from uavrl.experiments.runner import Run
+from uavrl.experiments.runner import Row, Run
 from uavrl.viewer.page import episode_figure
-
-Row = Mapping[str, Any]
 
 ABOUT = (
     "Made by `uavrl reproduce`, scale {scale}. Differences and their 95 % intervals are over training seeds and test "

@@ -13,7 +13,7 @@ import os
 import shutil
 import socket
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from uavrl.errors import ConfigError
 from uavrl.training.log import Reporter
 
 Scores = dict[str, Any]  # of one run, JSON
+Row = Mapping[str, Any]  # of the store: key, the run's fields, scores, seconds, machine
 
 _ANSWER_S = 10.0  # within which a cluster must answer
 RETRIES = 10  # of a run whose worker or node is lost
@@ -51,7 +52,8 @@ class Run(BaseModel):
 
 
 Function = Callable[[Run, Path], Scores]
-Finished = Iterator[tuple[Run, Scores, float]]  # with its seconds of processor time
+Ended = tuple[Scores, float, dict[str, Any]]  # with its seconds of processor time, and its machine
+Finished = Iterator[tuple[Run, Ended]]
 
 
 def finished(store: Path) -> dict[str, dict[str, Any]]:
@@ -61,6 +63,14 @@ def finished(store: Path) -> dict[str, dict[str, Any]]:
     lines = store.read_text(encoding="utf-8").splitlines()
     rows = [json.loads(line) for line in lines if line.endswith("}")]
     return {row["key"]: row for row in rows}
+
+
+def grouped(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """Rows by variant, in their order; each holds a variant's seeds."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(row["variant"], []).append(row)
+    return groups
 
 
 def run_all(
@@ -89,13 +99,14 @@ def run_all(
     store.parent.mkdir(parents=True, exist_ok=True)
     rows = finished(store)
     missing = {run.key: run for run in runs if run.key not in rows}
-    done, about = len(runs) - len(missing), {"machine": machine()}
+    done = len(runs) - len(missing)
     report(done, "")
     unfinished = store.with_suffix(".unfinished").absolute()
     places = [(run, unfinished / key) for key, run in missing.items()]
     ended = _here(places, function, workers) if cluster is None else _on_cluster(places, function, cluster)
-    for run, scores, seconds in ended if places else ():
-        row = {"key": run.key, **run.model_dump(mode="json"), "scores": scores, "seconds": round(seconds, 1), **about}
+    for run, (scores, seconds, where) in ended if places else ():
+        row = {"key": run.key, **run.model_dump(mode="json"), "scores": scores, "seconds": round(seconds, 1)}
+        row["machine"] = where
         _append(store, row)
         rows[run.key] = row
         shutil.rmtree(unfinished / run.key, ignore_errors=True)
@@ -113,7 +124,7 @@ def _here(places: Sequence[tuple[Run, Path]], function: Function, workers: int) 
     try:
         futures = {pool.submit(_timed, function, run, place): run for run, place in places}
         for future in as_completed(futures):
-            yield futures[future], *future.result()
+            yield futures[future], future.result()
     finally:
         pool.shutdown(cancel_futures=True)  # after an error or an interrupt none is begun any more
 
@@ -136,7 +147,7 @@ def _on_cluster(places: Sequence[tuple[Run, Path]], function: Function, address:
         waiting = {task.remote(function, run, place): run for run, place in places}
         while waiting:
             (ended, *_), _ = ray.wait(list(waiting))
-            yield waiting.pop(ended), *ray.get(ended)
+            yield waiting.pop(ended), ray.get(ended)
     finally:
         ray.shutdown()  # leaves the cluster; the runs that it was doing for us end
 
@@ -150,11 +161,11 @@ def _append(store: Path, row: dict[str, Any]) -> None:
         os.fsync(file.fileno())
 
 
-def _timed(function: Function, run: Run, directory: Path) -> tuple[Scores, float]:
+def _timed(function: Function, run: Run, directory: Path) -> Ended:
     """In a process that keeps to one core. Of a run that goes on, the seconds of its last part."""
     import torch
 
     torch.set_num_threads(1)
     directory.mkdir(parents=True, exist_ok=True)
     started = time.process_time()
-    return function(run, directory), time.process_time() - started
+    return function(run, directory), time.process_time() - started, machine()

@@ -10,9 +10,7 @@ from rich.table import Table
 
 from uavrl.experiments.flights import Setting
 from uavrl.experiments.paper import FIGURES
-from uavrl.experiments.runner import Run
-
-Row = Mapping[str, Any]
+from uavrl.experiments.runner import Row, Run
 
 # Seconds of one core (AMD EPYC without AVX-512) an update, by agent and network, until a run of the kind has finished
 _UPDATE_S = {

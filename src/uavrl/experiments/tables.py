@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +23,8 @@ from uavrl.evaluation.statistics import (
 )
 from uavrl.experiments.flights import flown
 from uavrl.experiments.paper import OURS, ROUND_ROBIN, YARDSTICK
-from uavrl.experiments.plots import grouped
+from uavrl.experiments.runner import Row, grouped
 
-Row = Mapping[str, Any]
 Float = NDArray[np.float64]
 
 SEED = 0  # of the resampling
