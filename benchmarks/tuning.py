@@ -1,0 +1,72 @@
+"""The baselines' own settings, one changed at a time, on the trial layouts and with training seeds of their own.
+
+    python -m benchmarks.tuning OUT [ALGORITHM ...]
+
+Learns from the built-in data of unseen layouts as the comparison does, then writes OUT/tuning.jsonl and OUT/tuning.md.
+Interrupted, it goes on with what is missing.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from uavrl.evaluation.rollouts import TRIAL_SEED
+from uavrl.experiments.flights import measure
+from uavrl.experiments.paper import ALGORITHMS, OURS, PROTOCOLS, SCALES, Plan
+from uavrl.experiments.runner import Run, run_all
+from uavrl.experiments.tables import markdown, table
+from uavrl.training.log import progress
+
+SEED = 100  # of training, none of the comparison's
+WORKERS = 2
+BASE = "as set"
+_LONGER = {"discount": 0.998, "polyak": 0.1}
+_TAILS = {"huber": 3.0, "reward": {"clip": 10.0}}
+# what Diffusion-SAC was found to need of the settings that all share, and each algorithm's own
+CHOICES: dict[str, dict[str, dict[str, Any]]] = {
+    OURS: {},
+    "CQL": {
+        "gamma .998, polyak .1": _LONGER,
+        "huber 3, rewards to 10": _TAILS,
+        "cql_weight .15": {"cql_weight": 0.15},
+    },
+    "IQL": {
+        "gamma .998, polyak .1": _LONGER,
+        "huber 3, rewards to 10": _TAILS,
+        "expectile .9": {"expectile": 0.9},
+        "inverse_temperature 10": {"inverse_temperature": 10.0},
+    },
+    "BCQ": {
+        "gamma .998, polyak .1": _LONGER,
+        "huber 3, rewards to 10": _TAILS,
+        "threshold .1": {"threshold": 0.1},
+    },
+    "BC": {"displacement_weight 1": {"displacement_weight": 1.0}, "learning_rate .0003": {"learning_rate": 3e-4}},
+}
+
+
+def runs(algorithms: Sequence[str]) -> list[Run]:
+    """The comparison's runs with other seeds, flown once on each trial layout."""
+    plan, protocol = Plan(SCALES["standard"]), PROTOCOLS["layouts"]
+    found = plan.references(protocol)
+    for name in algorithms:
+        for choice, changes in {BASE: {}, **CHOICES[name]}.items():
+            variant = name if name == OURS else f"{name}, {choice}"
+            found += plan.learned(name, protocol, 1, variant=variant, changes=changes)
+    own = {"seed": TRIAL_SEED, "fading_seeds": 1, "points": 1}
+    return [run.model_copy(update={"seed": SEED * (run.updates > 0), "options": run.options | own}) for run in found]
+
+
+def main(out: str, *algorithms: str) -> None:
+    """Learn what is missing and write the table."""
+    wanted = runs(algorithms or tuple(ALGORITHMS))
+    with progress("tuning", len(wanted), "run") as report:
+        rows = run_all(wanted, measure, Path(out) / "tuning.jsonl", WORKERS, report)
+    (Path(out) / "tuning.md").write_text(markdown(table(rows)), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
