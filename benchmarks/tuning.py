@@ -32,17 +32,24 @@ CHOICES: dict[str, dict[str, dict[str, Any]]] = {
         "gamma .998, polyak .1": _LONGER,
         "huber 3, rewards to 10": _TAILS,
         "cql_weight .15": {"cql_weight": 0.15},
+        "cql_weight .15, huber 3, rewards to 10": {"cql_weight": 0.15} | _TAILS,
+        "cql_weight .15, gamma .998, polyak .1, huber 3, rewards to 10": {"cql_weight": 0.15} | _LONGER | _TAILS,
     },
     "IQL": {
         "gamma .998, polyak .1": _LONGER,
         "huber 3, rewards to 10": _TAILS,
         "expectile .9": {"expectile": 0.9},
+        "expectile .6": {"expectile": 0.6},
         "inverse_temperature 10": {"inverse_temperature": 10.0},
+        "inverse_temperature 1": {"inverse_temperature": 1.0},
+        "learning_rate .0003": {"learning_rate": 3e-4},
     },
     "BCQ": {
         "gamma .998, polyak .1": _LONGER,
         "huber 3, rewards to 10": _TAILS,
         "threshold .1": {"threshold": 0.1},
+        "gamma .998, polyak .1, threshold .5": {"threshold": 0.5} | _LONGER,
+        "gamma .9995, polyak .5": {"discount": 0.9995, "polyak": 0.5},
     },
     "BC": {"displacement_weight 1": {"displacement_weight": 1.0}, "learning_rate .0003": {"learning_rate": 3e-4}},
 }
@@ -55,7 +62,7 @@ def runs(algorithms: Sequence[str]) -> list[Run]:
     for name in algorithms:
         for choice, changes in {BASE: {}, **CHOICES[name]}.items():
             variant = name if name == OURS else f"{name}, {choice}"
-            found += plan.learned(name, protocol, 1, variant=variant, changes=changes)
+            found += plan.learned(name, protocol, headline=True, variant=variant, changes=changes)[:1]
     own = {"seed": TRIAL_SEED, "fading_seeds": 1, "points": 1}
     return [run.model_copy(update={"seed": SEED * (run.updates > 0), "options": run.options | own}) for run in found]
 

@@ -22,7 +22,7 @@ SCENARIO = load_scenario("released", max_steps=15)
 
 
 def learned(algorithm: str, **changes: Any) -> Run:
-    (run,) = PLAN.learned(algorithm, PROTOCOLS["layouts"], 1)
+    (run,) = PLAN.learned(algorithm, PROTOCOLS["layouts"])
     return run.model_copy(update=changes)
 
 

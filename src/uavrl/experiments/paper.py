@@ -33,10 +33,11 @@ ONLINE = "online SAC"
 class Scale:
     """How much is computed."""
 
-    updates: int  # gradient steps with our settings
-    published_updates: int  # and with the paper's, which has 70,000: 150 passes over 30,000 rows in batches of 64
-    headline_seeds: int  # of the comparisons
-    sweep_seeds: int  # of everything else
+    updates: int  # gradient steps of the headline comparison, with our settings
+    sweep_updates: int  # of everything else
+    published_updates: int  # with the paper's settings: it has 70,000, 150 passes over 30,000 rows in batches of 64
+    headline_seeds: int
+    sweep_seeds: int
     online_flights: int
     episodes: int
     fading_seeds: int
@@ -48,9 +49,12 @@ class Scale:
 
 
 SCALES = {
-    "smoke": Scale(10, 4, 2, 1, 2, 4, 1, 2, (500, 1_000), (2, 5), (0.1, 0.9), 20),
-    "standard": Scale(4_000, 4_000, 5, 2, 700, 100, 3, 8, (10_000, 30_000, 50_000), (5, 10, 20, 50), (0.1, 0.5, 0.9)),
+    "smoke": Scale(10, 10, 4, 2, 1, 2, 4, 1, 2, (500, 1_000), (2, 5), (0.1, 0.9), 20),
+    "standard": Scale(
+        4_000, 2_000, 4_000, 5, 2, 700, 100, 3, 8, (10_000, 30_000, 50_000), (5, 10, 20, 50), (0.1, 0.5, 0.9)
+    ),
     "full": Scale(
+        12_000,
         12_000,
         70_000,
         5,
@@ -124,28 +128,29 @@ class Plan:
         self,
         algorithm: str,
         protocol: Protocol,
-        seeds: int,
         *,
+        headline: bool = False,
         variant: str | None = None,
         changes: Mapping[str, Any] | None = None,
         data: Mapping[str, Any] | None = None,
     ) -> list[Run]:
-        """One algorithm under a protocol with training seeds 0 to `seeds` - 1.
+        """One algorithm under a protocol with training seeds from 0 on.
 
         Args:
             algorithm: name of `ALGORITHMS`.
             protocol: where.
-            seeds: how many.
+            headline: with the seeds and updates of the headline comparison, not of a sweep.
             variant: what a figure calls it; by default the algorithm.
             changes: of its settings.
             data: fields of `Data` that differ from 30,000 mixed rows of the protocol's log.
         """
         every = _CHEAPER.get(algorithm, {}) | dict(changes or {})
         settings = changed(preset(ALGORITHMS[algorithm], protocol.preset), every).model_dump(mode="json")
-        published = protocol.preset == "paper"
         rows = Data(**{"name": protocol.data, "size": self.size, **(data or {})})
         options = self._setting(protocol, rows, protocol.deterministic(algorithm))
-        updates = self.scale.published_updates if published else self.scale.updates
+        updates = self.scale.updates if headline else self.scale.sweep_updates
+        if protocol.preset == "paper":
+            updates = self.scale.published_updates
         return [
             Run(
                 problem="offline",
@@ -155,7 +160,7 @@ class Plan:
                 seed=seed,
                 options=options,
             )
-            for seed in range(seeds)
+            for seed in range(self.scale.headline_seeds if headline else self.scale.sweep_seeds)
         ]
 
     @property
@@ -199,8 +204,7 @@ class Plan:
     def comparison(self, protocol: Protocol) -> list[Run]:
         """Every algorithm on equal data; the headline is of `released`, beside it stands the paper's objective."""
         headline = protocol.scenario.name == "released"
-        seeds = self.scale.headline_seeds if headline else self.scale.sweep_seeds
-        learned = [run for name in ALGORITHMS for run in self.learned(name, protocol, seeds)]
+        learned = [run for name in ALGORITHMS for run in self.learned(name, protocol, headline=headline)]
         by_seed = sorted(learned, key=lambda run: run.seed)  # one seed of all first
         return self.references(protocol) + by_seed
 
@@ -211,8 +215,8 @@ class Plan:
             for eta in (0.0, 0.5, 1.0):
                 changes = {"cql_weight": alpha, "bc_weight": eta}
                 name = f"alpha = {alpha:g}, eta = {eta:g}"
-                every += self.learned(OURS, protocol, self.scale.sweep_seeds, variant=name, changes=changes)
-        own = self.learned(OURS, protocol, self.scale.sweep_seeds, variant="our settings")
+                every += self.learned(OURS, protocol, variant=name, changes=changes)
+        own = self.learned(OURS, protocol, variant="our settings")
         return self.references(protocol) + every + (own if protocol.preset == "default" else [])
 
     def sizes(self, protocol: Protocol) -> list[Run]:
@@ -225,23 +229,22 @@ class Plan:
         return self._over_data(protocol, {name: {"size": rows, "quality": name} for name in ("good", "bad")})
 
     def _over_data(self, protocol: Protocol, choices: Mapping[str, Mapping[str, Any]]) -> list[Run]:
-        seeds = self.scale.sweep_seeds
         return self.references(protocol) + [
             run
             for label, data in choices.items()
             for name in ALGORITHMS
-            for run in self.learned(name, protocol, seeds, variant=f"{name} @ {label}", data=data)
+            for run in self.learned(name, protocol, variant=f"{name} @ {label}", data=data)
         ]
 
     def denoising(self, protocol: Protocol) -> list[Run]:
         """Steps M of the chain, under two noise schedules; the baselines beside them."""
-        seeds, found = self.scale.sweep_seeds, self.references(protocol)
+        found = self.references(protocol)
         for name in list(ALGORITHMS)[1:]:
-            found += self.learned(name, protocol, seeds)
+            found += self.learned(name, protocol)
         for schedule in ("linear", "vp"):
             for steps in self.scale.denoising_steps:
                 changes = {"diffusion": {"schedule": schedule, "steps": steps}}
-                found += self.learned(OURS, protocol, seeds, variant=f"{schedule} @ {steps}", changes=changes)
+                found += self.learned(OURS, protocol, variant=f"{schedule} @ {steps}", changes=changes)
         return found
 
     def age_weights(self) -> list[Run]:
@@ -251,14 +254,14 @@ class Plan:
             base = PROTOCOLS["paper-objective"]
             protocol = base._replace(scenario=base.scenario.replace(age_weight=weight))
             for name in ALGORITHMS:
-                found += self.learned(name, protocol, self.scale.sweep_seeds, variant=f"{name} @ {weight:g}")
+                found += self.learned(name, protocol, variant=f"{name} @ {weight:g}")
         return found
 
     def priorities(self) -> list[Run]:
         """Devices that matter more than others."""
         base = PROTOCOLS["layouts"]
         protocol = base._replace(scenario=base.scenario.replace(priority=PRIORITIES))
-        learned = [run for name in ALGORITHMS for run in self.learned(name, protocol, self.scale.sweep_seeds)]
+        learned = [run for name in ALGORITHMS for run in self.learned(name, protocol)]
         return self.references(protocol) + learned
 
     def biased(self) -> list[Run]:

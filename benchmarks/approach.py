@@ -1,0 +1,53 @@
+"""How near policies come to the best place to hover, and what they return beside the hover heuristic on equal flights.
+
+    python -m benchmarks.approach fixed|random POLICY [MORE ...]
+
+On trial flights of preset `released`, which no evaluation uses; deterministic actions. The best place is where hover
+ends up.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import torch
+
+from uavrl.cli.policies import resolve_all
+from uavrl.evaluation.rollouts import TRIAL_SEED, Flights, evaluation_set, fly
+from uavrl.policies import make_policy
+from uavrl.scenario import load_scenario
+
+STARTS, FADINGS = 100, 3
+AT = (0, 50, 100, 200, 400)  # steps
+LATER = 100
+
+
+def line(name: str, flights: Flights, hover: Flights) -> str:
+    """Return less hover's, idling, and the median distance left after some steps."""
+    ahead = ((flights.reward * flights.active) - (hover.reward * hover.active)).sum(axis=0)
+    of_start = ahead.reshape(-1, FADINGS).mean(axis=1)
+    half = 1.96 * of_start.std(ddof=1) / len(of_start) ** 0.5
+    idle = ((flights.device == 0) & flights.active)[LATER:].sum() / flights.active[LATER:].sum()
+    left = np.linalg.norm(flights.position_m - hover.position_m[-1], axis=2)
+    distances = (f"{np.median(left[min(step, len(left) - 1)]):.0f}" for step in AT)
+    return f"| {name} | {of_start.mean():+.1f} ± {half:.1f} | {100 * idle:.1f} | {' | '.join(distances)} |"
+
+
+def main(layouts: str, *names: str) -> None:
+    """Print the table."""
+    if layouts not in ("fixed", "random"):
+        sys.exit(f"layouts = {layouts!r}, allowed: fixed, random")
+    torch.set_num_threads(1)
+    scenario = load_scenario("released")
+    trial = evaluation_set(scenario, layouts, STARTS, seed=TRIAL_SEED, fading_seeds=FADINGS)
+    hover = fly(make_policy("hover"), trial)
+    columns = ("paired to hover", f"idle after {LATER} steps, %", *(f"m left after {step}" for step in AT))
+    print(f"| policy | {' | '.join(columns)} |")
+    print("|---" * (1 + len(columns)) + "|")
+    for name, policy in resolve_all(list(names), scenario).items():
+        print(line(name, fly(policy, trial, deterministic=True), hover), flush=True)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
