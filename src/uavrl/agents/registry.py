@@ -81,7 +81,9 @@ PRESETS: dict[str, dict[str, Offline]] = {
         ),
     },
     "cql": {
-        "default": CqlConfig(),
+        "default": CqlConfig(  # this one and those of IQL and BCQ: results/quality, "Tuning the baselines"
+            discount=0.998, polyak=0.1, cql_weight=0.15, huber=3.0, reward=RewardConfig(clip=10.0)
+        ),
         "paper": CqlConfig(
             **{**_PAPER_CLONE, "network": _PAPER_NETWORK.model_copy(update={"choice_heads": True})},
             **_PAPER_CRITIC,
@@ -89,11 +91,11 @@ PRESETS: dict[str, dict[str, Offline]] = {
         ),
     },
     "iql": {
-        "default": IqlConfig(),
+        "default": IqlConfig(inverse_temperature=1.0),
         "paper": IqlConfig(**_PAPER_CLONE, **_PAPER_CRITIC),
     },
     "bcq": {
-        "default": BcqConfig(),
+        "default": BcqConfig(discount=0.9995, polyak=0.5),
         "paper": BcqConfig(**_PAPER_CLONE, **_PAPER_CRITIC),
     },
     "bc": {
