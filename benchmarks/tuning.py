@@ -1,4 +1,4 @@
-"""The baselines' own settings, one changed at a time, on the trial layouts and with training seeds of their own.
+"""The baselines' settings, one at a time, then the promising ones together: trial layouts, and training seeds of their own.
 
     python -m benchmarks.tuning OUT [ALGORITHM ...]
 
@@ -75,6 +75,9 @@ def runs(algorithms: Sequence[str]) -> list[Run]:
 
 def main(out: str, *algorithms: str) -> None:
     """Learn what is missing and write the table."""
+    for name in algorithms:
+        if name not in CHOICES:
+            sys.exit(f"algorithm = {name!r}, allowed: {', '.join(CHOICES)}")
     wanted = runs(algorithms or tuple(ALGORITHMS))
     with progress("tuning", len(wanted), "run") as report:
         rows = run_all(wanted, measure, Path(out) / "tuning.jsonl", WORKERS, report)

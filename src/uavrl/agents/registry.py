@@ -131,7 +131,11 @@ def preset(agent: str, name: str) -> Offline:
 
 
 def changed(config: Config, changes: Mapping[str, Any]) -> Config:
-    """The configuration with settings changed, those of a section by a dict of their own; validated."""
+    """The configuration with settings changed, those of a section by a dict of their own.
+
+    Raises:
+        pydantic.ValidationError: no such setting, or a value that is not allowed.
+    """
     data = config.model_dump()
     for name, value in changes.items():
         data[name] = data[name] | value if isinstance(value, dict) else value

@@ -1,0 +1,49 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks import tuning
+from uavrl.agents.registry import preset
+from uavrl.evaluation.rollouts import TRIAL_SEED
+from uavrl.experiments.paper import ALGORITHMS, OURS, PROTOCOLS, SCALES, Plan
+from uavrl.experiments.runner import finished
+
+RUNS = tuning.runs(tuple(ALGORITHMS))
+BEST = {
+    "CQL": "cql_weight .15, gamma .998, polyak .1, huber 3, rewards to 10",
+    "IQL": "inverse_temperature 1",
+    "BCQ": "gamma .9995, polyak .5",
+    "BC": tuning.BASE,
+}
+
+
+def test_nothing_is_tuned_on_the_comparisons_seeds_or_layouts() -> None:
+    judged = Plan(SCALES["standard"]).comparison(PROTOCOLS["layouts"])
+    assert {run.options["seed"] for run in RUNS} == {TRIAL_SEED}
+    assert not {run.options["seed"] for run in judged} & {TRIAL_SEED}
+    assert not {run.seed for run in RUNS if run.updates} & {run.seed for run in judged}
+
+
+def test_the_best_of_each_is_its_default() -> None:
+    settings = {run.variant: run.settings for run in RUNS}
+    for name, choice in BEST.items():
+        candidates = {"candidates": 10} if name == "BCQ" else {}
+        default = preset(ALGORITHMS[name], "default").model_dump(mode="json")
+        assert settings[f"{name}, {choice}"] == default | candidates
+
+
+def test_the_committed_rows_are_those_of_the_command() -> None:
+    rows = finished(Path(__file__).parents[2] / "results" / "quality" / "tuning.jsonl")
+    assert set(rows) == {run.key for run in RUNS}
+    returned = {run.variant: sum(rows[run.key]["scores"]["flown"]["return"]) for run in RUNS}
+    for name, choice in BEST.items():
+        own = {variant: value for variant, value in returned.items() if variant.startswith(f"{name},")}
+        assert max(own, key=own.__getitem__) == f"{name}, {choice}"
+
+
+def test_an_unknown_algorithm_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match=f"algorithm = 'PPO', allowed: {OURS}, CQL"):
+        tuning.main(str(tmp_path), "PPO")
+    assert not any(tmp_path.iterdir())
