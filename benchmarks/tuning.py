@@ -1,4 +1,4 @@
-"""The baselines' settings, one at a time, then the promising ones together: trial layouts, and training seeds of their own.
+"""The baselines' settings, one at a time, then the best together: on trial layouts, with training seeds of their own.
 
     python -m benchmarks.tuning OUT [ALGORITHM ...]
 
