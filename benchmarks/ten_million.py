@@ -59,7 +59,8 @@ def memory_mb(name: str) -> float:
 def with_memory(call: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, Any]:
     """What `call` found, with its seconds, and the memory of this process."""
     torch.set_num_threads(1)
-    before, peak, done = memory_mb("RssAnon"), [0.0], Event()
+    before, done = memory_mb("RssAnon"), Event()
+    peak = [before]
 
     def watch() -> None:
         while not done.wait(0.005):
