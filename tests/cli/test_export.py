@@ -56,7 +56,12 @@ def test_samples_follow_the_flights_generator(folder: Path) -> None:
     [
         ("export nowhere", "checkpoint 'nowhere' does not exist"),
         ("export run -o gone/policy.onnx", "the directory 'gone' does not exist"),
-        ("export run --candidates 3", "--candidates 3, allowed: 1 or more, with --sampled"),
+        ("export run@candidates=3", "candidates = 3, allowed with --sampled"),
+        ("export run@candidates=0 --sampled", "field 'candidates' = '0'"),
+        ("export run@steps=3", "steps needs a solver: ddim or dpm"),
+        ("export run@solver=euler", "field 'solver' = 'euler'"),
+        ("export run@quick", "'quick', allowed: name=value, such as @solver=dpm,steps=3"),
+        ("export run@speed=3", "field 'speed'"),
         ("export run --verify --episodes 0", "--episodes 0, allowed: 1 or more"),
         ("evaluate --policy gone.onnx --scenario short.toml", "policy file 'gone.onnx' does not exist"),
     ],

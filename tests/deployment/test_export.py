@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 
 import uavrl
-from tests.agents.problems import KINDS, NAMES, Kind, agent, observation
+from tests.agents.problems import KINDS, NAMES, Kind, agent, noise, observation
 from tests.deployment.conftest import Exported
 from uavrl.agents.base import Agent
-from uavrl.agents.diffusion_actor import ChainNoise
+from uavrl.agents.diffusion_actor import ChainNoise, Solver
+from uavrl.agents.diffusion_sac import DiffusionSac
 from uavrl.datasets import load_builtin
 from uavrl.deployment import Policy
 from uavrl.deployment.export import export
@@ -94,10 +95,10 @@ def test_parity_of_samples(name: str, kind: Kind, exported: Exported) -> None:
     made, path = exported(name, kind, True, 10)
     seen = logged_and_random(kind)
     expected = made.act(seen, generator=torch.Generator().manual_seed(9))
-    noise = noise_of_act(made, name, ROWS, 9)
+    drawn = noise_of_act(made, name, ROWS, 9)
     policy = Policy(path)
-    assert policy.noise_shape(ROWS, 10) == tuple(noise.shape)
-    agree(expected, policy.decide(arrays(seen), noise.numpy()))
+    assert policy.noise_shape(ROWS, 10) == tuple(drawn.shape)
+    agree(expected, policy.decide(arrays(seen), drawn.numpy()))
 
 
 @pytest.mark.slow
@@ -107,9 +108,24 @@ def test_parity_of_candidates_that_are_re_ranked(tmp_path: Path) -> None:
     export(made, RELEASED, tmp_path / "policy.onnx", sampled=True)
     seen = observation("devices", 500)
     expected = made.act(seen, generator=torch.Generator().manual_seed(2))
-    noise = noise_of_act(made, "diffusion_sac", 500, 2)
-    assert noise.shape == (500, 4 * 6, 7)
-    agree(expected, Policy(tmp_path / "policy.onnx").decide(arrays(seen), noise.numpy()))
+    drawn = noise_of_act(made, "diffusion_sac", 500, 2)
+    assert drawn.shape == (500, 4 * 6, 7)
+    agree(expected, Policy(tmp_path / "policy.onnx").decide(arrays(seen), drawn.numpy()))
+
+
+@pytest.mark.parametrize("sampled", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_parity_of_a_solver_with_fewer_steps(sampled: bool, tmp_path: Path) -> None:
+    made = agent("diffusion_sac", "devices")
+    assert isinstance(made, DiffusionSac)
+    made.actor.use(Solver("dpm", 3))
+    info = export(made, RELEASED, tmp_path / "policy.onnx", sampled=sampled)
+    seen, policy = observation("devices", 500), Policy(tmp_path / "policy.onnx")
+    if sampled:
+        assert info["noise"]["rows"] == 1
+        start = noise(1, 500, 1, 7)
+        agree(made.decide(seen, start), policy.decide(arrays(seen), start.numpy()))
+    else:
+        agree(made.decide(seen, None), policy.decide(arrays(seen)))
 
 
 @pytest.mark.parametrize("kind", KINDS)

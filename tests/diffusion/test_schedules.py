@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.diffusion.reference import reference_beta
-from uavrl.diffusion import Schedule, ScheduleName, make_schedule, schedule_from_beta
+from uavrl.diffusion import Schedule, ScheduleName, make_schedule, schedule_from_beta, thinned
 
 NAMES: tuple[ScheduleName, ...] = get_args(ScheduleName)
 FIELDS = (
@@ -101,3 +101,24 @@ def test_unknown_name_is_refused() -> None:
 def test_no_steps_are_refused(steps: int) -> None:
     with pytest.raises(ValueError, match=rf"^steps: {steps} .* at least 1$"):
         make_schedule("vp", steps)
+
+
+@given(names, step_counts, st.data())
+def test_steps_that_are_left_keep_their_noise(name: ScheduleName, steps: int, data: st.DataObject) -> None:
+    fewer = data.draw(st.integers(1, steps))
+    schedule, kept = thinned(name, steps, fewer)
+    assert (len(kept), kept[-1]) == (fewer, steps)
+    assert min(np.diff([0, *kept])) >= 1
+    every = make_schedule(name, steps)
+    entries = torch.tensor(kept) - 1
+    for field in ("alpha_bar", "signal_scale", "noise_scale"):
+        np.testing.assert_allclose(getattr(schedule, field), getattr(every, field)[entries], rtol=3e-6, err_msg=field)
+
+
+def test_steps_that_are_left_are_evenly_spaced() -> None:
+    assert thinned("vp", 50, 5)[1] == [10, 20, 30, 40, 50]
+    assert thinned("vp", 5, 1)[1] == [5]
+    assert bool((thinned("vp", 7, 7)[0].beta == make_schedule("vp", 7).beta).all())
+    for fewer in (0, 6):
+        with pytest.raises(ValueError, match=f"steps: {fewer} is not allowed; allowed: 1 to 5"):
+            thinned("vp", 5, fewer)

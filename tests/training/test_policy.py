@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from tests.agents.problems import KINDS, NAMES, Kind, agent, observation
-from uavrl.errors import CheckpointError
+from uavrl.errors import CheckpointError, ConfigError
 from uavrl.scenario import Scenario, load_scenario
 from uavrl.training.checkpoint import agent_tensors, save_checkpoint
-from uavrl.training.policy import AgentPolicy, load_policy, trained_scenario
+from uavrl.training.policy import AgentPolicy, Decision, load_policy, trained_scenario
 
 SCENARIO = load_scenario("released", devices=4, max_steps=5)
 
@@ -62,10 +62,19 @@ def test_a_perceptron_for_another_number_of_devices_is_refused_and_a_set_network
     assert action.device.max() > 4
 
 
-def test_candidates_are_set_at_loading_where_the_agent_has_them(tmp_path: Path) -> None:
-    saved(tmp_path, "diffusion_sac", "devices")
-    policy = load_policy(tmp_path, SCENARIO, candidates=4)
-    assert getattr(policy.agent.config, "candidates", None) == 4
+def test_a_decision_is_changed_at_loading_where_the_agent_can(tmp_path: Path) -> None:
+    saved(tmp_path / "sac", "diffusion_sac", "devices")
+    agent = load_policy(tmp_path / "sac", SCENARIO, Decision(candidates=4, solver="dpm", steps=3)).agent
+    assert agent.noise_shape(5) == (4, 7)
+    assert load_policy(tmp_path / "sac", SCENARIO).agent.noise_shape(5) == (6, 7)
+    assert load_policy(tmp_path / "sac", SCENARIO, Decision(solver="ddim")).agent.noise_shape(5) == (1, 7)
+    with pytest.raises(ConfigError, match="steps = 6, allowed: 1 to 5, those of the chain as it was trained"):
+        load_policy(tmp_path / "sac", SCENARIO, Decision(solver="dpm", steps=6))
+    saved(tmp_path / "iql", "iql", "devices")
+    with pytest.raises(ConfigError, match="candidates = 4, allowed for agents that re-rank; iql does not"):
+        load_policy(tmp_path / "iql", SCENARIO, Decision(candidates=4))
+    with pytest.raises(ConfigError, match="solver = 'ddim', allowed for agents with a chain; iql has none"):
+        load_policy(tmp_path / "iql", SCENARIO, Decision(solver="ddim"))
 
 
 def test_a_checkpoint_of_something_else_is_refused_in_one_line(tmp_path: Path) -> None:

@@ -68,10 +68,10 @@ class BehaviourCloning(Agent):
 
     def noise_shape(self, choices: int) -> tuple[int, int]:
         """That of a chain: its start and its steps."""
-        return self.config.diffusion.steps + 1, self.spaces.continuous + choices
+        return self.actor.noise_steps + 1, self.spaces.continuous + choices
 
     def decide(self, observation: Observation, noise: Tensor | None) -> HybridAction:
         """See `Agent`."""
-        chain = None if noise is None else ChainNoise.of_rows(noise, self.config.diffusion.steps)
+        chain = None if noise is None else ChainNoise.of_rows(noise, self.actor.noise_steps)
         with torch.no_grad():
             return self.actor.decide(self.actor.average.encode(observation), chain)

@@ -5,6 +5,7 @@ Paper, Section V-B. All noise is an argument; `ChainNoise.draw` is the one place
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import deepcopy
 from typing import Literal, NamedTuple
 
@@ -13,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
 from uavrl.actions import HybridAction, decode
-from uavrl.diffusion import ChainDenoiser, Schedule, ScheduleName, ddim, ddpm, make_schedule
+from uavrl.diffusion import ChainDenoiser, Schedule, ScheduleName, ddim, ddpm, dpm_solver_pp_2m, make_schedule, thinned
 from uavrl.networks import Denoiser, NetworkConfig, Spaces, make_denoiser
 from uavrl.networks.interfaces import Context
 
@@ -31,6 +32,16 @@ class DiffusionConfig(BaseModel):
     )
     ddim_eta: float = Field(0.0, ge=0, le=1, description="0: deterministic, 1: as ddpm with the posterior variance")
     clip_x0: bool = Field(True, description="hold each predicted x_0 in [-1, 1]; the paper does not")
+
+
+SolverName = Literal["ddim", "dpm"]
+
+
+class Solver(NamedTuple):
+    """A deterministic walk from x_M to x_0 over some of the M steps: DDIM without noise, or DPM-Solver++(2M)."""
+
+    name: SolverName
+    steps: int  # 1 to M
 
 
 class ChainNoise(NamedTuple):
@@ -61,11 +72,26 @@ class DiffusionActor(nn.Module):
         self.denoiser = make_denoiser(spaces, network)
         self.average = deepcopy(self.denoiser).requires_grad_(False)
         self._schedule = make_schedule(config.schedule, config.steps)
+        self.use(None)
+
+    def use(self, solver: Solver | None) -> None:
+        """Decide by `solver`, a sample by its walk from a random x_M; None: as trained, and from x_M = 0 by DDIM.
+
+        Raises:
+            ValueError: its steps are not of the chain's.
+        """
+        self.solver = solver
+        self._walk = solver or Solver("ddim", self.config.steps)
+        self._walked, self._steps_walked = thinned(self.config.schedule, self.config.steps, self._walk.steps)
+
+    @property
+    def noise_steps(self) -> int:
+        """Steps of a decision's sample that take noise."""
+        return self.config.steps if self.solver is None else 0
 
     def schedule(self, device: torch.device) -> Schedule:
         """The noise schedule on `device`."""
-        if self._schedule.beta.device != device:
-            self._schedule = self._schedule.to(device)
+        self._schedule = _on(self._schedule, device)
         return self._schedule
 
     def sample(
@@ -95,33 +121,44 @@ class DiffusionActor(nn.Module):
         )
 
     def map(self, denoiser: Denoiser, context: Context, start: Tensor) -> Tensor:
-        """x_0 (N, C + D) that DDIM without noise makes of x_M = start (N, C + D)."""
-        predict = self._chain(denoiser, context, start.device)
-        return ddim(predict, self.schedule(start.device), start, None, clip_x0=self.config.clip_x0)
+        """x_0 (N, C + D) that the solver, by default DDIM over all steps, makes of x_M = start (N, C + D)."""
+        self._walked = _on(self._walked, start.device)
+        predict = self._chain(denoiser, context, start.device, self._steps_walked)
+        if self._walk.name == "dpm":
+            return dpm_solver_pp_2m(predict, self._walked, start, clip_x0=self.config.clip_x0)
+        return ddim(predict, self._walked, start, None, clip_x0=self.config.clip_x0)
 
-    def _chain(self, denoiser: Denoiser, context: Context, device: torch.device) -> ChainDenoiser:
+    def _chain(
+        self, denoiser: Denoiser, context: Context, device: torch.device, kept: Sequence[int] | None = None
+    ) -> ChainDenoiser:
         """The network as the samplers call it, with the parts of s and of all steps computed here, once."""
-        steps = denoiser.steps(torch.arange(1, self.config.steps + 1, device=device)).split(1)
+        numbers = torch.tensor(kept or range(1, self.config.steps + 1), device=device)
+        steps = denoiser.steps(numbers).split(1)
         return lambda vector, step: denoiser.predict(context, vector, steps[step - 1])
 
     @torch.no_grad()
     def act(self, context: Context, generator: torch.Generator, deterministic: bool) -> HybridAction:
-        """One action a row by the average network; deterministic: DDIM from zero noise."""
+        """One action a row by the average network; deterministic: from x_M = 0."""
         return self.decide(context, None if deterministic else self.draw(context, generator))
 
     def draw(self, context: Context, generator: torch.Generator) -> ChainNoise:
         """Noise of one sample a row."""
-        return ChainNoise.draw(len(context[0]), self.average.vector_size(context), self.config.steps, generator)
+        return ChainNoise.draw(len(context[0]), self.average.vector_size(context), self.noise_steps, generator)
 
     @torch.no_grad()
     def decide(self, context: Context, noise: ChainNoise | None) -> HybridAction:
-        """One action a row by the average network; without noise: DDIM from zero."""
-        if noise is None:
-            size = (context[0].shape[0], self.average.vector_size(context))
-            vector = self.map(self.average, context, torch.zeros(size, device=context[0].device))
-        else:
+        """One action a row by the average network; without noise: from x_M = 0."""
+        if noise is not None and self.solver is None:
             vector = self.sample(self.average, context, noise)
+        else:
+            size = (context[0].shape[0], self.average.vector_size(context))
+            start = torch.zeros(size, device=context[0].device) if noise is None else noise.start
+            vector = self.map(self.average, context, start)
         return decode(self.average.possible(context, vector), self.continuous)
+
+
+def _on(schedule: Schedule, device: torch.device) -> Schedule:
+    return schedule if schedule.beta.device == device else schedule.to(device)
 
 
 def block_mean(error: Tensor, continuous: int, weight: float) -> Tensor:

@@ -291,7 +291,7 @@ class DiffusionSac(Agent):
 
     def noise_shape(self, choices: int) -> tuple[int, int]:
         """That of a chain, its start and its steps, for each candidate."""
-        return self.config.candidates * (self.config.diffusion.steps + 1), self.spaces.continuous + choices
+        return self.config.candidates * (self.actor.noise_steps + 1), self.spaces.continuous + choices
 
     @torch.no_grad()
     def decide(self, observation: Observation, noise: Tensor | None) -> HybridAction:
@@ -299,7 +299,7 @@ class DiffusionSac(Agent):
         context = self.actor.average.encode(observation)
         if noise is None:
             return self._decide(observation, context, None)
-        chain = ChainNoise.of_rows(noise, self.config.diffusion.steps)
+        chain = ChainNoise.of_rows(noise, self.actor.noise_steps)
         return self._decide(observation, repeat(context, self.config.candidates), chain)
 
     def _decide(self, observation: Observation, context: Context, noise: ChainNoise | None) -> HybridAction:

@@ -24,7 +24,8 @@ class Evaluate:
     """Fly policies on equal layouts, starts and fading draws, and compare them with 95 % bootstrap intervals."""
 
     policy: Many
-    """a heuristic's name, a checkpoint's directory, pretrained:NAME, an .onnx file, your module:Class; repeat it"""
+    """a heuristic's name, a checkpoint's directory or pretrained:NAME (@solver=dpm,steps=3 behind it: decide so), an
+    .onnx file, your module:Class; repeat it"""
     scenario: str = "released"
     """a preset (paper, released, realistic) or a TOML file"""
     layouts: str = "random"

@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 
 from uavrl.cli.evaluate import check_writable
+from uavrl.cli.policies import checkpoint_and_decision
 from uavrl.errors import ConfigError
 
 
@@ -17,14 +18,13 @@ from uavrl.errors import ConfigError
 class Export:
     """Write a trained policy as one ONNX file, which flies with numpy and onnxruntime alone."""
 
-    checkpoint: tyro.conf.Positional[Path]
-    """directory of a run or of a checkpoint"""
+    checkpoint: tyro.conf.Positional[str]
+    """directory of a run or of a checkpoint, or pretrained:NAME; @candidates=N,solver=ddim|dpm,steps=N behind it
+    changes how it decides"""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("policy.onnx")
     """the file"""
     sampled: bool = False
     """sample the policy, from noise that is an input; without, its deterministic action"""
-    candidates: int | None = None
-    """with --sampled, of an agent that re-ranks: actions that a decision chooses from; none: as trained"""
     verify: bool = False
     """fly the file and the checkpoint on equal flights and compare the returns"""
     episodes: int = 100
@@ -32,8 +32,9 @@ class Export:
 
     def run(self) -> None:
         check_writable(self.out)
-        if self.candidates is not None and not (self.sampled and self.candidates >= 1):
-            raise ConfigError(f"--candidates {self.candidates}, allowed: 1 or more, with --sampled")
+        path, decision = checkpoint_and_decision(self.checkpoint)
+        if decision.candidates is not None and not self.sampled:
+            raise ConfigError(f"candidates = {decision.candidates}, allowed with --sampled")
         if self.episodes < 1:
             raise ConfigError(f"--episodes {self.episodes}, allowed: 1 or more")
         if self.verify and find_spec("onnxruntime") is None:
@@ -42,9 +43,9 @@ class Export:
         from uavrl.training.checkpoint import checkpoint_in, load_checkpoint
         from uavrl.training.policy import load_policy, trained_scenario
 
-        scenario = trained_scenario(self.checkpoint)
-        trained = load_policy(self.checkpoint, scenario, self.candidates)
-        facts = facts_of(load_checkpoint(checkpoint_in(self.checkpoint)).document)
+        scenario = trained_scenario(path)
+        trained = load_policy(path, scenario, decision)
+        facts = facts_of(load_checkpoint(checkpoint_in(path)).document) | decision.model_dump(exclude_none=True)
         info = export(trained.agent, scenario, self.out, sampled=self.sampled, facts=facts)
         devices = "any number of devices" if "devices" in info["inputs"] else f"K = {info['devices']}"
         kind = "samples from noise" if self.sampled else "deterministic"

@@ -8,16 +8,20 @@ import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from uavrl.cli.settings import pydantic_config
 from uavrl.errors import ConfigError
 from uavrl.policies import POLICIES, make_policy
 from uavrl.policies.base import Policy
 from uavrl.scenario import Scenario
 
+if TYPE_CHECKING:
+    from uavrl.training.policy import Decision
+
 
 def resolve(spec: str, scenario: Scenario) -> Policy:
-    """A heuristic by name, a checkpoint by its directory or as pretrained:NAME, an exported file, your module:Class.
+    """A heuristic by name, a checkpoint (see `checkpoint_and_decision`), an exported file, your module:Class.
 
     Raises:
         ConfigError: there is no such policy, or `module:Class` cannot be imported or is no policy.
@@ -25,13 +29,14 @@ def resolve(spec: str, scenario: Scenario) -> Policy:
     """
     if spec in POLICIES:
         return make_policy(spec)
-    installed = spec.startswith("pretrained:")
-    if installed or Path(spec).is_dir():
+    place, settings = _split(spec)
+    installed = place.startswith("pretrained:")
+    if installed or Path(place).is_dir():
         from uavrl.training.policy import load_policy  # here: torch is slow to import
 
-        policy = load_policy(Path(spec), scenario)
-        if installed:
-            policy.name = spec
+        path, decision = checkpoint_and_decision(spec)
+        policy = load_policy(path, scenario, decision)
+        policy.name = (place if installed else policy.name) + (f"@{settings}" if settings else "")
         return policy
     if spec.endswith(".onnx"):
         if find_spec("onnxruntime") is None:
@@ -43,8 +48,32 @@ def resolve(spec: str, scenario: Scenario) -> Policy:
         return _import(spec, scenario)
     raise ConfigError(
         f"policy '{spec}' does not exist, allowed: {', '.join(POLICIES)}, the directory of a checkpoint, "
-        "pretrained:NAME, an .onnx file, module:Class"
+        "pretrained:NAME, either with @candidates=N,solver=ddim|dpm,steps=N, an .onnx file, module:Class"
     )
+
+
+def checkpoint_and_decision(spec: str) -> tuple[Path, Decision]:
+    """`runs/mine`, `pretrained:NAME`, or either followed by how it is to decide: `runs/mine@solver=dpm,steps=3`.
+
+    Raises:
+        ConfigError: no such setting of a decision, or a value that it does not allow.
+    """
+    from uavrl.training.policy import Decision  # here: torch is slow to import
+
+    place, settings = _split(spec)
+    values: dict[str, str] = {}
+    for setting in settings.split(",") if settings else ():
+        name, equals, value = setting.partition("=")
+        if not equals:
+            raise ConfigError(f"policy '{spec}': {setting!r}, allowed: name=value, such as @solver=dpm,steps=3")
+        values[name] = value
+    return Path(place), pydantic_config(Decision, **values)
+
+
+def _split(spec: str) -> tuple[str, str]:
+    """What stands before the last @ and after it; a directory's own name may hold one."""
+    place, _, settings = (spec, "", "") if Path(spec).is_dir() or "@" not in spec else spec.rpartition("@")
+    return place, settings
 
 
 def resolve_all(specs: Sequence[str], scenario: Scenario) -> dict[str, Policy]:

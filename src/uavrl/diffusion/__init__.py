@@ -13,7 +13,7 @@ from uavrl.diffusion.samplers import (
     predict_x0,
     straight_through_clamp,
 )
-from uavrl.diffusion.schedules import Schedule, ScheduleName, make_schedule, schedule_from_beta
+from uavrl.diffusion.schedules import Schedule, ScheduleName, make_schedule, schedule_from_beta, thinned
 
 __all__ = [
     "ChainDenoiser",
@@ -31,4 +31,5 @@ __all__ = [
     "predict_x0",
     "schedule_from_beta",
     "straight_through_clamp",
+    "thinned",
 ]

@@ -79,6 +79,22 @@ def make_schedule(name: ScheduleName, steps: int) -> Schedule:
     return schedule_from_beta(_BETAS[name](steps))
 
 
+def thinned(name: ScheduleName, steps: int, fewer: int) -> tuple[Schedule, list[int]]:
+    """`fewer` steps of those of `make_schedule(name, steps)`, evenly spaced, the last among them, and which they are.
+
+    Each keeps its alpha_bar, so a denoiser trained with all of them serves the ones that are left (Song et al. 2021).
+    Raises ValueError as `make_schedule`, and for `fewer` outside 1..steps.
+    """
+    every = make_schedule(name, steps)
+    if not 1 <= fewer <= steps:
+        raise ValueError(f"steps: {fewer} is not allowed; allowed: 1 to {steps}")
+    kept = [round(steps * k / fewer) for k in range(1, fewer + 1)]
+    if fewer == steps:
+        return every, kept
+    log_alpha_bar = torch.log1p(-_BETAS[name](steps)).cumsum(0)[torch.tensor(kept) - 1]
+    return schedule_from_beta(-torch.expm1(log_alpha_bar.diff(prepend=log_alpha_bar.new_zeros(1)))), kept
+
+
 def _vp(steps: int) -> Tensor:
     i = torch.arange(1, steps + 1, dtype=torch.float64)
     return -torch.expm1(-_VP_MIN / steps - 0.5 * (_VP_MAX - _VP_MIN) * (2 * i - 1) / steps**2)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 import torch
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from uavrl.agents.base import Agent
+from uavrl.agents.diffusion_actor import DiffusionActor, Solver, SolverName
 from uavrl.agents.registry import AnyConfig, make_agent
-from uavrl.errors import CheckpointError
+from uavrl.errors import CheckpointError, ConfigError
 from uavrl.networks import Spaces
 from uavrl.scenario import Scenario, parse_scenario
 from uavrl.simulation.state import FlightAction
@@ -24,6 +25,45 @@ from uavrl.training.checkpoint import (
     restore_networks,
     save_checkpoint,
 )
+
+
+class Decision(BaseModel):
+    """How a trained policy decides, where that is not to be as it was trained."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    candidates: int | None = Field(None, ge=1, description="actions drawn at a decision, for an agent that re-ranks")
+    solver: SolverName | None = Field(None, description="ddim without noise, or dpm: DPM-Solver++(2M)")
+    steps: int | None = Field(None, ge=1, description="of the solver, at most M; by default M")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.steps is not None and self.solver is None:
+            raise ValueError("steps needs a solver: ddim or dpm")
+        return self
+
+    def apply(self, agent: Agent) -> None:
+        """Let `agent` decide so.
+
+        Raises:
+            ConfigError: the agent has no such part, or a chain of fewer steps.
+        """
+        name = agent.config.name  # type: ignore[attr-defined]  # every agent's own config names it
+        if self.candidates is not None:
+            if not hasattr(agent.config, "candidates"):
+                raise ConfigError(f"candidates = {self.candidates}, allowed for agents that re-rank; {name} does not")
+            agent.config = agent.config.model_copy(update={"candidates": self.candidates})
+        if self.solver is not None:
+            actor = getattr(agent, "actor", None)
+            if not isinstance(actor, DiffusionActor):
+                raise ConfigError(f"solver = {self.solver!r}, allowed for agents with a chain; {name} has none")
+            most = actor.config.steps
+            if self.steps is not None and self.steps > most:
+                raise ConfigError(f"steps = {self.steps}, allowed: 1 to {most}, those of the chain as it was trained")
+            actor.use(Solver(self.solver, self.steps or most))
+
+
+AS_TRAINED = Decision()
 
 
 class AgentPolicy:
@@ -92,11 +132,12 @@ def ship(run: Path, out: Path) -> None:
     save_checkpoint(out, {"kind": "policy", **document}, {"networks": networks})
 
 
-def load_policy(path: Path, scenario: Scenario, candidates: int | None = None) -> AgentPolicy:
+def load_policy(path: Path, scenario: Scenario, decision: Decision = AS_TRAINED) -> AgentPolicy:
     """The policy of a run's directory or of a checkpoint's, for `scenario`.
 
     Raises:
         CheckpointError: missing or damaged; or a perceptron trained with another number of devices.
+        ConfigError: a decision that the agent cannot make.
     """
     path = Path(path)
     place = checkpoint_in(path)
@@ -107,8 +148,7 @@ def load_policy(path: Path, scenario: Scenario, candidates: int | None = None) -
         raise CheckpointError(
             f"checkpoint '{path}' is a perceptron for devices = {trained}, the scenario has {devices}"
         )
-    if candidates is not None and hasattr(agent.config, "candidates"):
-        agent.config = agent.config.model_copy(update={"candidates": candidates})
+    decision.apply(agent)
     name = str(checkpoint.document.get("agent", place.name))
     return AgentPolicy(name, agent, scenario)
 
