@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from uavrl.agents.base import Agent
 from uavrl.agents.diffusion_sac import DiffusionSacConfig
 from uavrl.agents.one_step import OneStepConfig
 from uavrl.agents.registry import make_agent, preset
@@ -83,22 +84,32 @@ def floor_s(products: Products, each_s: float) -> float:
 
 
 def measure(name: str, seconds: float, scenario: Scenario | None = None) -> dict[str, float]:
-    """Milliseconds of `Policy.decide` for one aircraft, of its floor, and decisions a second for `AIRCRAFT` at once.
-
-    The floor is the products of one decision with each of the network's matrices, one after another. Weights are not
-    trained, which changes no time.
-    """
+    """`decision` of one of `CASES`, untrained, which changes no time."""
     scenario = load_scenario("released") if scenario is None else scenario
     config = settings(CASES[name])
-    kind = OBSERVATION_OF[config.network.kind]
-    logged, _ = load_builtin("layouts").observations(kind, scenario)
     state = torch.random.get_rng_state()
     agent = make_agent(spaces_of(scenario, config.network.kind), config)
     torch.random.set_rng_state(state)
-    seen = to_tensors(logged)
-    fit_normalisers(agent.networks, seen)
+    logged, _ = load_builtin("layouts").observations(OBSERVATION_OF[config.network.kind], scenario)
+    fit_normalisers(agent.networks, to_tensors(logged))
+    return decision(name, agent, scenario, seconds)
+
+
+def decision(name: str, agent: Agent, scenario: Scenario, seconds: float, *, sampled: bool = False) -> dict[str, float]:
+    """Milliseconds of `Policy.decide` for one aircraft, of its floor, and decisions a second for `AIRCRAFT` at once.
+
+    The floor is the products of one decision with each of the network's matrices, one after another.
+
+    Args:
+        name: prefix of the keys.
+        agent: is exported and decides on logged observations.
+        scenario: of the observations.
+        seconds: that each time and rate is measured for.
+        sampled: its samples, drawing the noise included; else its deterministic action.
+    """
+    logged, _ = load_builtin("layouts").observations(OBSERVATION_OF[agent.config.network.kind], scenario)
     with tempfile.TemporaryDirectory() as folder:
-        export(agent, scenario, Path(folder) / "policy.onnx")
+        export(agent, scenario, Path(folder) / "policy.onnx", sampled=sampled)
         policy = Policy(Path(folder) / "policy.onnx")
 
     def rows(index: slice | int) -> Any:
@@ -107,9 +118,9 @@ def measure(name: str, seconds: float, scenario: Scenario | None = None) -> dict
     count = len(next(iter(logged.values())) if isinstance(logged, dict) else logged)
     singles = [rows(index) for index in range(min(count, 1000))]
     taken = times_s(lambda index: policy.decide(singles[index % len(singles)]), seconds)
-    products = Products()
+    products, noise = Products(), torch.zeros((1, *agent.noise_shape(agent.spaces.choices)))
     with products, torch.no_grad():
-        agent.decide(to_tensors(rows(slice(0, 1))), None)
+        agent.decide(to_tensors(rows(slice(0, 1))), noise if sampled else None)
     many = rows(slice(0, AIRCRAFT))
     batch = rate(lambda: policy.decide(many), work=min(count, AIRCRAFT), seconds=seconds, repeats=3)
     return {

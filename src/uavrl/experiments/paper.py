@@ -114,7 +114,7 @@ PROTOCOLS = {
 }
 PRIORITIES = (0.25, 0.25, 0.25) + (0.25 / 7,) * 7  # three devices of ten weigh three quarters
 # Fewest of BCQ's authors' 10 to 100 actions at a decision: its flights would take longer than its training
-_CHEAPER = {"BCQ": {"candidates": 10}}
+CHEAPER = {"BCQ": {"candidates": 10}}
 STARVED = (1, 2)  # devices whose services the biased log lacks
 
 
@@ -144,7 +144,7 @@ class Plan:
             changes: of its settings.
             data: fields of `Data` that differ from 30,000 mixed rows of the protocol's log.
         """
-        every = _CHEAPER.get(algorithm, {}) | dict(changes or {})
+        every = CHEAPER.get(algorithm, {}) | dict(changes or {})
         settings = changed(preset(ALGORITHMS[algorithm], protocol.preset), every).model_dump(mode="json")
         rows = Data(**{"name": protocol.data, "size": self.size, **(data or {})})
         options = self._setting(protocol, rows, protocol.deterministic(algorithm))

@@ -1,0 +1,264 @@
+"""Fewer denoising steps: what a decision costs in time, and what it loses, steps x solver x candidates, and a student.
+
+    for s in 0 1 2 3 4; do
+      uavrl train diffusion_sac --out RUNS/teacher-$s --set diffusion.steps=50 --updates 4000 --seed $s
+      uavrl distill RUNS/teacher-$s --out RUNS/student-$s --seed $s
+    done
+    python -m benchmarks.steps fly RUNS OUT [SEED ...]    # the evaluation's 100 layouts x 3 fadings
+    python -m benchmarks.steps time RUNS OUT              # exported policies of seed 0, on an otherwise idle machine
+    python -m benchmarks.steps charge RUNS OUT [SEED ...] # flights that are charged those times
+    python -m benchmarks.steps draw OUT COMPARISON        # COMPARISON: rows of `uavrl reproduce comparison`
+
+Rows in OUT/steps.jsonl, times in OUT/steps-times.json, tables in OUT/steps.md and OUT/charged.md, the figure in
+OUT/steps.png. What is in them is not computed again.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+
+from uavrl.agents.registry import changed, make_agent, preset
+from uavrl.benchmarks.decide import decision
+from uavrl.benchmarks.timing import machine
+from uavrl.evaluation.metrics import flight_metrics
+from uavrl.evaluation.report import write_json, write_text
+from uavrl.evaluation.rollouts import EvaluationSet, evaluation_set, fly
+from uavrl.evaluation.statistics import Estimate, excess_cost, over_seeds, unit_means
+from uavrl.experiments.paper import ALGORITHMS, CHEAPER, PROTOCOLS, SCALES, YARDSTICK, Plan
+from uavrl.experiments.runner import finished
+from uavrl.experiments.tables import estimated, interval, markdown
+from uavrl.scenario import Scenario, load_scenario
+from uavrl.training.batches import spaces_of
+from uavrl.training.policy import Decision, load_policy
+
+SEEDS = (0, 1, 2, 3, 4)
+EPISODES, FADINGS = 100, 3
+KEPT = ("return", "age_per_step_s", "age_per_second_s", "energy_per_step_j", "duration_s", "steps")
+TIMED_S = 3.0
+
+
+class Way(NamedTuple):
+    """A way to decide."""
+
+    name: str
+    run: str  # teacher or student
+    decision: Decision = Decision()
+    deterministic: bool = True
+
+
+def _ways() -> Iterator[Way]:
+    yield Way("one-step student", "student")
+    yield Way("one-step student, best of 10 samples", "student", Decision(candidates=10), deterministic=False)
+    for steps in (1, 2, 3, 5, 10, 50):
+        yield Way(f"DDIM, {steps}", "teacher", Decision(solver="ddim", steps=steps))
+    for steps in (3, 5, 10):  # with one step or two DPM-Solver++(2M) is DDIM
+        yield Way(f"DPM-Solver++(2M), {steps}", "teacher", Decision(solver="dpm", steps=steps))
+    for steps in (1, 5):
+        for candidates in (1, 10):
+            decided = Decision(solver="ddim", steps=steps, candidates=candidates)
+            best = "a sample" if candidates == 1 else f"best of {candidates} samples"
+            yield Way(f"DDIM, {steps}, {best}", "teacher", decided, deterministic=False)
+    yield Way("ancestral, 50, a sample (the paper's)", "teacher", deterministic=False)
+
+
+WAYS = {way.name: way for way in _ways()}
+TEACHER = "DDIM, 50"
+CHARGED = ("one-step student", "DDIM, 1", "DDIM, 2", "DDIM, 5", "DDIM, 10", TEACHER)
+SLOWER = {"this machine": 1.0, "ten times slower": 10.0, "a hundred times slower": 100.0}
+
+FAMILIES = {  # of the figure: colour, marker, line
+    "one-step student": ("#D55E00", "D", ""),
+    "DDIM": ("#0072B2", "o", "-"),
+    "DPM-Solver++(2M)": ("#009E73", "s", "-"),
+    "samples": ("#56B4E9", "^", ""),
+    "other algorithms": ("#000000", "X", ""),
+}
+
+
+def environments(scenario: Scenario) -> EvaluationSet:
+    """Those of the comparison."""
+    return evaluation_set(scenario, "random", EPISODES, fading_seeds=FADINGS)
+
+
+def flown(runs: Path, way: Way, seed: int, scenario: Scenario) -> dict[str, Any]:
+    """Metrics of each environment, means over its fadings."""
+    policy = load_policy(runs / f"{way.run}-{seed}", scenario, way.decision)
+    metrics = flight_metrics(fly(policy, environments(scenario), deterministic=way.deterministic))
+    unit = np.repeat(np.arange(EPISODES), FADINGS)
+    return {name: [float(f"{value:.5g}") for value in unit_means(metrics[name], unit)] for name in KEPT}
+
+
+def keep(out: Path, rows: list[tuple[Way, int, str, Scenario]], runs: Path) -> None:
+    """Fly what OUT/steps.jsonl lacks; a row is named by way, seed and how it was charged."""
+    out.mkdir(parents=True, exist_ok=True)
+    store = out / "steps.jsonl"
+    done = {(row["way"], row["seed"], row["charged"]) for row in stored(store)}
+    for way, seed, charged, scenario in rows:
+        if (way.name, seed, charged) in done:
+            continue
+        row = {"way": way.name, "seed": seed, "charged": charged, "decision_s": scenario.airframe.decision_s}
+        line = json.dumps(row | {"flown": flown(runs, way, seed, scenario), "machine": machine()})
+        with store.open("a", encoding="utf-8") as file:
+            file.write(line + "\n")
+        print(f"{way.name}, seed {seed}, {charged}", flush=True)
+
+
+def stored(store: Path) -> list[dict[str, Any]]:
+    """Its rows."""
+    return [json.loads(line) for line in store.read_text(encoding="utf-8").splitlines()] if store.exists() else []
+
+
+def times(runs: Path, out: Path) -> None:
+    """Of each way with seed 0, exported; and of the algorithms beside it, untrained, which changes no time."""
+    scenario, file = load_scenario("released"), out / "steps-times.json"
+    found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {"machine": machine()}
+    for name, way in WAYS.items():
+        if f"{name}_ms" not in found:
+            agent = load_policy(runs / f"{way.run}-0", scenario, way.decision).agent
+            found |= decision(name, agent, scenario, TIMED_S, sampled=not way.deterministic)
+            write_json(file, found)
+            print(f"{name}: {found[f'{name}_ms']:.3g} ms", flush=True)
+    for name, agent_name in ALGORITHMS.items():
+        if f"{name}_ms" not in found:
+            config = changed(preset(agent_name, "default"), CHEAPER.get(name, {}))
+            agent = make_agent(spaces_of(scenario, config.network.kind), config)
+            sampled = not PROTOCOLS["layouts"].deterministic(name)
+            found |= decision(name, agent, scenario, TIMED_S, sampled=sampled)
+            write_json(file, found)
+            print(f"{name}: {found[f'{name}_ms']:.3g} ms", flush=True)
+
+
+def charges(out: Path) -> Iterator[tuple[Way, str, Scenario]]:
+    """Each way of `CHARGED` with its measured time as T_exec, and on slower machines."""
+    known = json.loads((out / "steps-times.json").read_text(encoding="utf-8"))
+    scenario = load_scenario("released")
+    for name in CHARGED:
+        for charged, factor in SLOWER.items():
+            airframe = scenario.airframe.model_copy(update={"decision_s": 1e-3 * factor * known[f"{name}_ms"]})
+            yield WAYS[name], charged, scenario.model_copy(update={"airframe": airframe})
+
+
+def gathered(rows: Sequence[dict[str, Any]], way: str, metric: str, charged: str = "") -> np.ndarray[Any, Any]:
+    """A metric over seeds and environments (R, E), seeds in order."""
+    own = sorted((row for row in rows if (row["way"], row["charged"]) == (way, charged)), key=lambda row: row["seed"])
+    return np.array([row["flown"][metric] for row in own])
+
+
+def tables(out: Path, comparison: Path) -> None:
+    """Write both tables and the figure."""
+    rows, known = stored(out / "steps.jsonl"), json.loads((out / "steps-times.json").read_text(encoding="utf-8"))
+    beside = _beside(comparison)
+    planner = estimated(beside[YARDSTICK])
+    # one name for all: ways of a seed's teacher and student share its luck, so seeds are resampled together
+    returns = {name: gathered(rows, name, "return") for name in WAYS}
+    teacher = estimated(returns[TEACHER], "teacher")
+    lines = [
+        ["decision", "seeds", "return", "over the planner, %", "over the 50-step teacher, %", "median, ms", "99 %, ms",
+         "floor, ms", "10,000 at once, decisions/s"],
+    ]  # fmt: skip
+    points: dict[str, tuple[float, Estimate]] = {}
+    for name in [*WAYS, *ALGORITHMS]:
+        values = returns[name] if name in WAYS else beside[name]
+        if not len(values):
+            continue
+        own = estimated(values, "teacher" if name in WAYS else name)
+        excess = excess_cost(own, planner)
+        points[name] = known[f"{name}_ms"], excess
+        lost = interval(excess_cost(own, teacher).interval(), 100.0, digits=1, signed=True) if name in WAYS else ""
+        milliseconds = [f"{known[f'{name}_{key}']:.3g}" for key in ("ms", "p99_ms", "floor_ms")]
+        batch = f"{known[f'{name}_batch_decisions_per_s']:,.3g}"
+        found = [interval(own.interval(), digits=0), interval(excess.interval(), 100.0, digits=1), lost]
+        lines.append([name, str(len(values)), *found, *milliseconds, batch])
+    write_text(out / "steps.md", markdown(lines))
+    write_text(out / "charged.md", markdown(_charged_table(rows)))
+    _figure(points, out / "steps.png")
+
+
+def _beside(comparison: Path) -> dict[str, np.ndarray[Any, Any]]:
+    """Returns (R, E) of the planner and of the algorithms, from the comparison's rows, as far as they are there."""
+    store = finished(comparison)
+    found: dict[str, list[Any]] = {name: [] for name in (YARDSTICK, *ALGORITHMS)}
+    for run in Plan(SCALES["standard"]).comparison(PROTOCOLS["layouts"]):
+        if run.variant in found and run.key in store:
+            found[run.variant].append(store[run.key]["scores"]["flown"]["return"])
+    return {name: np.array(values) for name, values in found.items()}
+
+
+def _charged_table(rows: Sequence[dict[str, Any]]) -> list[list[str]]:
+    lines = [["decision", "T_exec", "ms", "age per step, s", "age per second, s", "flight, s", "return"]]
+    for name in CHARGED:
+        for charged in ("", *SLOWER):
+            own = [row for row in rows if (row["way"], row["charged"]) == (name, charged)]
+            if not own:
+                continue
+            cells = [
+                interval(over_seeds(gathered(rows, name, metric, charged).mean(axis=1).tolist()), digits=digits)
+                for metric, digits in (("age_per_step_s", 3), ("age_per_second_s", 3), ("duration_s", 0), ("return", 0))
+            ]
+            spent = 1e3 * float(np.mean([row["decision_s"] for row in own]))
+            lines.append([name, charged or "as in the scenario", f"{spent:.3g}", *cells])
+    return lines
+
+
+def _figure(points: dict[str, tuple[float, Estimate]], path: Path) -> None:
+    """Excess cost over decision time."""
+    figure = Figure(figsize=(7.16, 3.6), layout="constrained")
+    axes = figure.subplots()
+    for label, (colour, marker, line) in FAMILIES.items():
+        own = {name: point for name, point in points.items() if _family(name) == label}
+        x = np.array([time for time, _ in own.values()])
+        found = [100.0 * np.array(excess.interval()) for _, excess in own.values()]
+        y, low, high = np.array(found).T if found else np.empty((3, 0))
+        axes.errorbar(
+            x, y, yerr=[y - low, high - y], color=colour, marker=marker, linestyle=line, markersize=4, capsize=2,
+            linewidth=0.9, label=label,
+        )  # fmt: skip
+        for name, time, height in zip(own, x, y, strict=True):
+            if note := _note(name):
+                axes.annotate(note, (time, height), xytext=(4, 3), textcoords="offset points", fontsize=6)
+    axes.set(xscale="log", xlabel="time of a decision, median (ms)", ylabel="cost over the planner (%)")
+    axes.grid(visible=True, alpha=0.3, linewidth=0.5)
+    axes.legend(fontsize=7)
+    figure.savefig(path, dpi=200)
+
+
+def _family(name: str) -> str:
+    if name in ALGORITHMS:
+        return "other algorithms"
+    if name.startswith("one-step"):
+        return "one-step student"
+    return "samples" if "sample" in name else name.partition(",")[0]
+
+
+def _note(name: str) -> str:
+    if name in ALGORITHMS:
+        return name
+    return name.partition(", ")[2].replace(" (the paper's)", "").replace("best of 10 samples", "best of 10")
+
+
+def main(task: str, *words: str) -> None:
+    """See the module."""
+    torch.set_num_threads(1)
+    if task == "draw" and len(words) == 2:
+        return tables(Path(words[0]), Path(words[1]))
+    if task == "time" and len(words) == 2:
+        return times(Path(words[0]), Path(words[1]))
+    if task not in ("fly", "charge") or len(words) < 2:
+        sys.exit(__doc__)
+    runs, out = Path(words[0]), Path(words[1])
+    seeds = [int(word) for word in words[2:]] or SEEDS
+    scenario = load_scenario("released")
+    every = [(way, "", scenario) for way in WAYS.values()] if task == "fly" else list(charges(out))
+    return keep(out, [(way, seed, charged, other) for seed in seeds for way, charged, other in every], runs)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:] or ("",))
