@@ -91,7 +91,7 @@ PRESETS: dict[str, dict[str, Offline]] = {
         ),
     },
     "iql": {
-        "default": IqlConfig(inverse_temperature=1.0),
+        "default": IqlConfig(learning_rate=3e-4),
         "paper": IqlConfig(**_PAPER_CLONE, **_PAPER_CRITIC),
     },
     "bcq": {
