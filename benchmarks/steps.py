@@ -174,7 +174,7 @@ def tables(out: Path, comparison: Path) -> None:
         points[name] = known[f"{name}_ms"], excess
         lost = interval(excess_cost(own, teacher).interval(), 100.0, digits=1, signed=True) if name in WAYS else ""
         milliseconds = [f"{known[f'{name}_{key}']:.3g}" for key in ("ms", "p99_ms", "floor_ms")]
-        batch = f"{known[f'{name}_batch_decisions_per_s']:,.3g}"
+        batch = f"{known[f'{name}_batch_decisions_per_s']:,.0f}"
         found = [interval(own.interval(), digits=0), interval(excess.interval(), 100.0, digits=1), lost]
         lines.append([name, str(len(values)), *found, *milliseconds, batch])
     write_text(out / "steps.md", markdown(lines))
