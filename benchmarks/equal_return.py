@@ -1,0 +1,145 @@
+"""How long until our default returns what the paper's configuration returns in the end, over training seeds.
+
+    python -m benchmarks.equal_return OUT RATES.json [ROWS.jsonl]
+
+Both learn from the built-in data of one layout and are judged in the evaluation's environments. RATES are those of
+`uavrl bench train --json`, measured in one run: a curve's axis is updates over updates a second, flights left out.
+ROWS of `uavrl reproduce` may hold the paper's runs already. Writes OUT/equal-return.jsonl, .md and .png; interrupted,
+it goes on with what is missing.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from uavrl.evaluation.report import write_text
+from uavrl.evaluation.statistics import Interval, over_seeds
+from uavrl.experiments.flights import flown, measure
+from uavrl.experiments.paper import OURS, PROTOCOLS, ROUND_ROBIN, SCALES, YARDSTICK, Plan
+from uavrl.experiments.runner import Row, Run, finished, run_all
+from uavrl.experiments.tables import interval, markdown
+from uavrl.training.log import progress
+
+Float = NDArray[np.float64]
+
+WORKERS = 2
+SHARE = 0.95  # of the final gain over TDM
+UPDATES, POINTS = 1_000, 20  # of our default
+PAPER, DEFAULT = "the paper's configuration", "our default"
+
+
+def runs() -> list[Run]:
+    """References, then both configurations; the paper's are the comparison's own runs."""
+    plan, published = Plan(SCALES["standard"]), PROTOCOLS["published"]
+    paper = plan.learned(OURS, published, headline=True, variant=PAPER)
+    ours = plan.learned(OURS, published._replace(preset="default"), headline=True, variant=DEFAULT)
+    short = {"updates": UPDATES}
+    ours = [run.model_copy(update=short | {"options": run.options | {"points": POINTS}}) for run in ours]
+    return plan.references(published) + [run for pair in zip(ours, paper, strict=True) for run in pair]
+
+
+class Curves(NamedTuple):
+    """Returns of R seeds after P times of training."""
+
+    seconds: Float  # (P,)
+    returned: Float  # (R, P)
+
+
+def curves(rows: Sequence[Row], variant: str, per_s: float) -> Curves:
+    """From the rows of a variant, each seed's curve at the same updates."""
+    own = sorted((row for row in rows if row["variant"] == variant), key=lambda row: row["seed"])
+    at = np.array(own[0]["scores"]["curve"]["at"], dtype=np.float64)
+    return Curves(at / per_s, np.array([row["scores"]["curve"]["return"] for row in own], dtype=np.float64))
+
+
+def sooner(paper: Curves, ours: Curves, tdm: float) -> tuple[float, Float]:
+    """The return that is asked for, and each seed's time to it as a share of the paper's whole time, (R,).
+
+    Asked for is TDM's return and `SHARE` of what the paper's configuration gains over it in the end, mean over seeds. A
+    seed is there at the first point that is as high, if the mean from there on is, too; infinite where it never is.
+    """
+    wanted = tdm + SHARE * (paper.returned[:, -1].mean() - tdm)
+    taken = []
+    for curve in ours.returned:
+        onwards = np.cumsum(curve[::-1])[::-1] / np.arange(len(curve), 0, -1)
+        there = np.flatnonzero((curve >= wanted) & (onwards >= wanted))
+        taken.append(ours.seconds[there[0]] if len(there) else np.inf)
+    return float(wanted), np.array(taken) / paper.seconds[-1]
+
+
+def report(rows: Sequence[Row], rates: dict[str, Any], out: Path) -> None:
+    """The table and the figure."""
+    paper, ours = (
+        curves(rows, name, rates[f"{key}_updates_per_s"]) for name, key in ((PAPER, "paper"), (DEFAULT, "default"))
+    )
+    known = {row["variant"]: float(flown(row, "return").mean()) for row in rows if row["updates"] == 0}
+    wanted, share = sooner(paper, ours, known[ROUND_ROBIN])
+    lines = [["configuration", "seeds", "updates", "time, s", "updates/s", "of its floor, %", "return at the end"]]
+    for name, key, curve in ((PAPER, "paper", paper), (DEFAULT, "default", ours)):
+        per_s = rates[f"{key}_updates_per_s"]
+        floor = 100.0 * per_s / rates[f"{key}_updates_floor_per_s"]
+        ends = interval(over_seeds(curve.returned[:, -1].tolist()), digits=0)
+        cells = [f"{per_s * curve.seconds[-1]:,.0f}", f"{curve.seconds[-1]:.0f}", f"{per_s:.3g}", f"{floor:.0f}", ends]
+        lines.append([name, str(len(curve.returned)), *cells])
+    factors = [1.0 / one for one in share]
+    text = markdown(lines) + (
+        f"\nTDM returns {known[ROUND_ROBIN]:.0f}, the planner {known[YARDSTICK]:.0f}. Asked for: {wanted:.0f}, "
+        f"{SHARE:.0%} of the paper's configuration's final gain over TDM. Our default is there "
+        f"{', '.join(f'{factor:.1f}' for factor in factors)} times sooner (each seed; in the mean over seeds of the "
+        f"logarithm {np.exp(np.mean(np.log(factors))):.1f}).\n"
+    )
+    write_text(out / "equal-return.md", text)
+    _figure(paper, ours, known, wanted, out / "equal-return.png")
+
+
+def _figure(paper: Curves, ours: Curves, known: dict[str, float], wanted: float, path: Path) -> None:
+    figure = Figure(figsize=(7.16, 3.2), layout="constrained")
+    axes = figure.subplots()
+    for label, curve, colour in ((PAPER, paper, "#D55E00"), (DEFAULT, ours, "#0072B2")):
+        bands: list[Interval] = [over_seeds(point.tolist()) for point in curve.returned.T]
+        mean, low, high = np.array(bands).T
+        axes.plot(curve.seconds, curve.returned.T, color=colour, linewidth=0.4, alpha=0.5)
+        axes.plot(curve.seconds, mean, color=colour, linewidth=1.5, label=label)
+        axes.fill_between(curve.seconds, low, high, color=colour, alpha=0.15, linewidth=0)
+    for name in (ROUND_ROBIN, YARDSTICK):
+        axes.axhline(known[name], color="0.4", linewidth=0.8, linestyle="--")
+        axes.annotate(name, (paper.seconds[-1], known[name]), fontsize=7, ha="right", va="bottom")
+    axes.axhline(wanted, color="#009E73", linewidth=0.8, linestyle=":", label=f"{SHARE:.0%} of the paper's gain")
+    lowest = min(known[ROUND_ROBIN], float(paper.returned[:, -1].min()))
+    span = known[YARDSTICK] - lowest
+    axes.set(
+        xscale="log",
+        xlabel="training on one core (s)",
+        ylabel="return",
+        ylim=(lowest - span, known[YARDSTICK] + span / 4),
+    )
+    axes.grid(visible=True, alpha=0.3, linewidth=0.5)
+    axes.legend(fontsize=7)
+    figure.savefig(path, dpi=200)
+
+
+def main(out: str = "", rates: str = "", *known: str) -> None:
+    """Learn what is missing and write the table."""
+    if not rates or len(known) > 1:
+        sys.exit(__doc__)
+    store, wanted = Path(out) / "equal-return.jsonl", runs()
+    if known and not store.exists():
+        rows = finished(Path(known[0]))
+        Path(out).mkdir(parents=True, exist_ok=True)
+        found = [json.dumps(rows[run.key]) for run in wanted if run.key in rows]
+        write_text(store, "".join(line + "\n" for line in found))
+    with progress("equal return", len(wanted), "run") as told:
+        done = run_all(wanted, measure, store, WORKERS, told)
+    report(done, json.loads(Path(rates).read_text(encoding="utf-8")), Path(out))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
