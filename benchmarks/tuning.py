@@ -32,7 +32,9 @@ _LONGER = {"discount": 0.998, "polyak": 0.1}
 _TAILS = {"huber": 3.0, "reward": {"clip": 10.0}}
 # what Diffusion-SAC was found to need of the settings that all share, and each algorithm's own
 CHOICES: dict[str, dict[str, dict[str, Any]]] = {
-    OURS: {},
+    OURS: {
+        "L_g through the whole chain": {"gradient": "full_chain"},
+    },
     "CQL": {
         "gamma .998, polyak .1": _LONGER,
         "huber 3, rewards to 10": _TAILS,
@@ -68,7 +70,7 @@ def runs(algorithms: Sequence[str]) -> list[Run]:
     found = plan.references(protocol)
     for name in algorithms:
         for choice, changes in {BASE: {}, **CHOICES[name]}.items():
-            variant = name if name == OURS else f"{name}, {choice}"
+            variant = name if (name, choice) == (OURS, BASE) else f"{name}, {choice}"
             settings = START.get(name, {}) | changes
             seeds = SEEDS if choice in FINALISTS.get(name, ()) else SEEDS[:1]
             learned = plan.learned(name, protocol, headline=True, variant=variant, changes=settings)[: len(seeds)]
