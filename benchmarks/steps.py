@@ -10,7 +10,7 @@
     python -m benchmarks.steps draw OUT COMPARISON        # COMPARISON: rows of `uavrl reproduce comparison`
 
 Rows in OUT/steps.jsonl, times in OUT/steps-times.json, tables in OUT/steps.md and OUT/charged.md, the figure in
-OUT/steps.png. What is in them is not computed again.
+OUT/steps.png. What is in them is not computed again: with other policies begin another OUT.
 """
 
 from __future__ import annotations
@@ -97,12 +97,12 @@ def flown(runs: Path, way: Way, seed: int, scenario: Scenario) -> dict[str, Any]
 
 
 def keep(out: Path, rows: list[tuple[Way, int, str, Scenario]], runs: Path) -> None:
-    """Fly what OUT/steps.jsonl lacks; a row is named by way, seed and how it was charged."""
+    """Fly what OUT/steps.jsonl lacks; a row is named by way, seed and what it was charged."""
     out.mkdir(parents=True, exist_ok=True)
     store = out / "steps.jsonl"
-    done = {(row["way"], row["seed"], row["charged"]) for row in stored(store)}
+    done = {(row["way"], row["seed"], row["charged"], row["decision_s"]) for row in stored(store)}
     for way, seed, charged, scenario in rows:
-        if (way.name, seed, charged) in done:
+        if (way.name, seed, charged, scenario.airframe.decision_s) in done:
             continue
         row = {"way": way.name, "seed": seed, "charged": charged, "decision_s": scenario.airframe.decision_s}
         line = json.dumps(row | {"flown": flown(runs, way, seed, scenario), "machine": machine()})
@@ -112,8 +112,9 @@ def keep(out: Path, rows: list[tuple[Way, int, str, Scenario]], runs: Path) -> N
 
 
 def stored(store: Path) -> list[dict[str, Any]]:
-    """Its rows."""
-    return [json.loads(line) for line in store.read_text(encoding="utf-8").splitlines()] if store.exists() else []
+    """Its rows; a last line that was cut short does not count."""
+    lines = store.read_text(encoding="utf-8").splitlines() if store.exists() else []
+    return [json.loads(line) for line in lines if line.endswith("}")]
 
 
 def times(runs: Path, out: Path) -> None:
@@ -159,6 +160,8 @@ def tables(out: Path, comparison: Path) -> None:
     planner = estimated(beside[YARDSTICK])
     # one name for all: ways of a seed's teacher and student share its luck, so seeds are resampled together
     returns = {name: gathered(rows, name, "return") for name in WAYS}
+    if len({len(values) for values in returns.values()}) > 1:
+        sys.exit(f"{out / 'steps.jsonl'} has not the same seeds of every way: let `fly` finish")
     teacher = estimated(returns[TEACHER], "teacher")
     lines = [
         ["decision", "seeds", "return", "over the planner, %", "over the 50-step teacher, %", "median, ms", "99 %, ms",

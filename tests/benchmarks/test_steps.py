@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks import steps
 from tests.training.test_policy import saved
+from uavrl.experiments.flights import Setting
 from uavrl.experiments.paper import ALGORITHMS, PROTOCOLS, SCALES, YARDSTICK, Plan
 from uavrl.scenario import load_scenario
 
@@ -37,6 +38,18 @@ def test_every_way_is_flown_once_in_the_comparisons_environments(runs: Path) -> 
     assert len({tuple(row["flown"]["return"]) for row in rows}) == len(WAYS)
     steps.main("fly", str(runs), str(runs / "out"), "0")
     assert (runs / "out" / "steps.jsonl").read_text() == first
+    with (runs / "out" / "steps.jsonl").open("a") as file:
+        file.write('{"way": "cut sh')
+    assert len(steps.stored(runs / "out" / "steps.jsonl")) == len(rows)
+
+
+def test_the_environments_are_the_comparisons() -> None:
+    plan = Plan(SCALES["standard"]).comparison(PROTOCOLS["layouts"])[0]
+    compared = Setting.model_validate(plan.options)
+    expected, found = compared.environments(compared.fading_seeds), steps.environments(compared.scenario)
+    assert (found.seed, found.fading_seeds) == (expected.seed, expected.fading_seeds)
+    assert (found.layout_m == expected.layout_m).all()
+    assert (found.start_m == expected.start_m).all()
 
 
 def test_a_decision_that_takes_longer_is_charged_to_the_flight(runs: Path) -> None:

@@ -11,6 +11,7 @@ from tests.training.test_policy import SCENARIO, saved
 from uavrl.cli import main
 from uavrl.cli.policies import resolve
 from uavrl.deployment import Policy
+from uavrl.deployment.flight import ExportedPolicy
 from uavrl.deployment.verify import Verification
 from uavrl.errors import ConfigError
 from uavrl.scenario import load_scenario
@@ -51,6 +52,36 @@ def test_samples_follow_the_flights_generator(folder: Path) -> None:
         policy.act(seen, generator=np.random.default_rng(1), deterministic=True)
 
 
+def test_a_decision_is_changed_wherever_a_policy_is_flown_or_exported(folder: Path) -> None:
+    saved(folder / "run", "diffusion_sac", "devices")
+    saved(folder / "a@b", "diffusion_sac", "devices")
+    specs = ["run", "run@solver=ddim,steps=2", "run@candidates=3", "a@b", "a@b@solver=ddim,steps=2"]
+    policies = [resolve(spec, SCENARIO) for spec in specs]
+    assert [policy.name for policy in policies] == [
+        "diffusion_sac",
+        "diffusion_sac@solver=ddim,steps=2",
+        "diffusion_sac@candidates=3",
+        "diffusion_sac",
+        "diffusion_sac@solver=ddim,steps=2",
+    ]
+    seen = {"uav": np.ones((6, 4), np.float32), "devices": np.ones((6, 4, 6), np.float32)}
+    whole, fewer, again, same = (
+        policies[index].act(seen, generator=np.random.default_rng(1), deterministic=True) for index in (0, 1, 4, 3)
+    )
+    assert (whole.displacement_m == same.displacement_m).all()
+    assert (fewer.displacement_m == again.displacement_m).all()
+    assert (whole.displacement_m != fewer.displacement_m).any()
+    with pytest.raises(ConfigError, match="candidates to choose from, allowed: without --deterministic"):
+        policies[2].act(seen, generator=np.random.default_rng(1), deterministic=True)
+    assert main(["export", "run@solver=ddim,steps=1", "-o", "policy.onnx"]) == 0
+    exported = resolve("policy.onnx", SCENARIO)
+    assert isinstance(exported, ExportedPolicy)
+    assert exported.policy.info["decision"] == {"solver": "ddim", "steps": 1}
+    one = resolve("run@solver=ddim,steps=1", SCENARIO).act(seen, generator=np.random.default_rng(1), deterministic=True)
+    found = exported.act(seen, generator=np.random.default_rng(1), deterministic=True)
+    np.testing.assert_allclose(found.displacement_m, one.displacement_m, atol=1e-3)
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -60,8 +91,9 @@ def test_samples_follow_the_flights_generator(folder: Path) -> None:
         ("export run@candidates=0 --sampled", "field 'candidates' = '0'"),
         ("export run@steps=3", "steps needs a solver: ddim or dpm"),
         ("export run@solver=euler", "field 'solver' = 'euler'"),
-        ("export run@quick", "'quick', allowed: name=value, such as @solver=dpm,steps=3"),
-        ("export run@speed=3", "field 'speed'"),
+        ("export run@quick", "policy 'run@quick': 'quick', allowed: candidates=N, solver=ddim|dpm, steps=N, each once"),
+        ("export run@kind=3", "'kind=3', allowed: candidates=N"),
+        ("export run@solver=ddim,solver=dpm", "'solver=dpm', allowed: candidates=N"),
         ("export run --verify --episodes 0", "--episodes 0, allowed: 1 or more"),
         ("evaluate --policy gone.onnx --scenario short.toml", "policy file 'gone.onnx' does not exist"),
     ],

@@ -5,7 +5,6 @@ Paper, Section V-B. All noise is an argument; `ChainNoise.draw` is the one place
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from copy import deepcopy
 from typing import Literal, NamedTuple
 
@@ -82,7 +81,8 @@ class DiffusionActor(nn.Module):
         """
         self.solver = solver
         self._walk = solver or Solver("ddim", self.config.steps)
-        self._walked, self._steps_walked = thinned(self.config.schedule, self.config.steps, self._walk.steps)
+        self._walked, kept = thinned(self.config.schedule, self.config.steps, self._walk.steps)
+        self._steps_walked = torch.tensor(kept)
 
     @property
     def noise_steps(self) -> int:
@@ -91,7 +91,8 @@ class DiffusionActor(nn.Module):
 
     def schedule(self, device: torch.device) -> Schedule:
         """The noise schedule on `device`."""
-        self._schedule = _on(self._schedule, device)
+        if self._schedule.beta.device != device:
+            self._schedule = self._schedule.to(device)
         return self._schedule
 
     def sample(
@@ -122,17 +123,18 @@ class DiffusionActor(nn.Module):
 
     def map(self, denoiser: Denoiser, context: Context, start: Tensor) -> Tensor:
         """x_0 (N, C + D) that the solver, by default DDIM over all steps, makes of x_M = start (N, C + D)."""
-        self._walked = _on(self._walked, start.device)
+        if self._steps_walked.device != start.device:
+            self._walked, self._steps_walked = self._walked.to(start.device), self._steps_walked.to(start.device)
         predict = self._chain(denoiser, context, start.device, self._steps_walked)
         if self._walk.name == "dpm":
             return dpm_solver_pp_2m(predict, self._walked, start, clip_x0=self.config.clip_x0)
         return ddim(predict, self._walked, start, None, clip_x0=self.config.clip_x0)
 
     def _chain(
-        self, denoiser: Denoiser, context: Context, device: torch.device, kept: Sequence[int] | None = None
+        self, denoiser: Denoiser, context: Context, device: torch.device, kept: Tensor | None = None
     ) -> ChainDenoiser:
         """The network as the samplers call it, with the parts of s and of all steps computed here, once."""
-        numbers = torch.tensor(kept or range(1, self.config.steps + 1), device=device)
+        numbers = torch.arange(1, self.config.steps + 1, device=device) if kept is None else kept
         steps = denoiser.steps(numbers).split(1)
         return lambda vector, step: denoiser.predict(context, vector, steps[step - 1])
 
@@ -155,10 +157,6 @@ class DiffusionActor(nn.Module):
             start = torch.zeros(size, device=context[0].device) if noise is None else noise.start
             vector = self.map(self.average, context, start)
         return decode(self.average.possible(context, vector), self.continuous)
-
-
-def _on(schedule: Schedule, device: torch.device) -> Schedule:
-    return schedule if schedule.beta.device == device else schedule.to(device)
 
 
 def block_mean(error: Tensor, continuous: int, weight: float) -> Tensor:

@@ -45,7 +45,9 @@ class Export:
 
         scenario = trained_scenario(path)
         trained = load_policy(path, scenario, decision)
-        facts = facts_of(load_checkpoint(checkpoint_in(path)).document) | decision.model_dump(exclude_none=True)
+        facts = facts_of(load_checkpoint(checkpoint_in(path)).document) | {
+            "decision": decision.model_dump(exclude_none=True)
+        }
         info = export(trained.agent, scenario, self.out, sampled=self.sampled, facts=facts)
         devices = "any number of devices" if "devices" in info["inputs"] else f"K = {info['devices']}"
         kind = "samples from noise" if self.sampled else "deterministic"

@@ -64,10 +64,15 @@ def checkpoint_and_decision(spec: str) -> tuple[Path, Decision]:
     values: dict[str, str] = {}
     for setting in settings.split(",") if settings else ():
         name, equals, value = setting.partition("=")
-        if not equals:
-            raise ConfigError(f"policy '{spec}': {setting!r}, allowed: name=value, such as @solver=dpm,steps=3")
+        if not equals or name not in Decision.model_fields or name in values:
+            raise ConfigError(
+                f"policy '{spec}': '{setting}', allowed: candidates=N, solver=ddim|dpm, steps=N, each once"
+            )
         values[name] = value
-    return Path(place), pydantic_config(Decision, **values)
+    try:
+        return Path(place), pydantic_config(Decision, **values)
+    except ConfigError as error:
+        raise ConfigError(f"policy '{spec}': {error}") from None
 
 
 def _split(spec: str) -> tuple[str, str]:

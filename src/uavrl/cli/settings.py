@@ -44,7 +44,7 @@ def _value(text: str) -> Any:
         return text
 
 
-def pydantic_config(kind: type[Config], **values: Any) -> Config:
+def pydantic_config(kind: type[Config], /, **values: Any) -> Config:
     """A configuration from what a user typed.
 
     Raises:

@@ -18,7 +18,8 @@ class Watch:
     """Fly a policy once and make a web page of the flight: one file, opened by any browser, no network needed."""
 
     policy: tyro.conf.Positional[str]
-    """a heuristic's name, a checkpoint's directory, pretrained:NAME, an .onnx file, or your own module:Class"""
+    """a heuristic's name, a checkpoint's directory or pretrained:NAME (@solver=dpm,steps=3 behind it: decide so), an
+    .onnx file, or your own module:Class"""
     scenario: str = "released"
     """a preset (paper, released, realistic) or a TOML file"""
     layouts: str = "random"

@@ -46,7 +46,11 @@ class Schedule:
 def schedule_from_beta(beta: Tensor) -> Schedule:
     """Derive every constant from beta (M,), each entry in (0, 1); computed in float64, stored in float32."""
     beta = beta.double()
-    log_alpha_bar = torch.log1p(-beta).cumsum(0)
+    return _derived(beta, torch.log1p(-beta).cumsum(0))
+
+
+def _derived(beta: Tensor, log_alpha_bar: Tensor) -> Schedule:
+    """All constants, of float64; alpha_bar is not taken from beta, which may round to 1 where few steps go far."""
     log_alpha_bar_previous = torch.cat([log_alpha_bar.new_zeros(1), log_alpha_bar[:-1]])
     noise_variance, noise_variance_previous = -torch.expm1(log_alpha_bar), -torch.expm1(log_alpha_bar_previous)
     constants = (
@@ -92,7 +96,7 @@ def thinned(name: ScheduleName, steps: int, fewer: int) -> tuple[Schedule, list[
     if fewer == steps:
         return every, kept
     log_alpha_bar = torch.log1p(-_BETAS[name](steps)).cumsum(0)[torch.tensor(kept) - 1]
-    return schedule_from_beta(-torch.expm1(log_alpha_bar.diff(prepend=log_alpha_bar.new_zeros(1)))), kept
+    return _derived(-torch.expm1(log_alpha_bar.diff(prepend=log_alpha_bar.new_zeros(1))), log_alpha_bar), kept
 
 
 def _vp(steps: int) -> Tensor:

@@ -69,9 +69,10 @@ AS_TRAINED = Decision()
 class AgentPolicy:
     """Maps observations to displacements in metres and devices."""
 
-    def __init__(self, name: str, agent: Agent, scenario: Scenario) -> None:
+    def __init__(self, name: str, agent: Agent, scenario: Scenario, decision: Decision = AS_TRAINED) -> None:
         self.name = name
         self.agent = agent
+        self.decision = decision
         self.reach_m = scenario.airframe.max_displacement_m
         self.needs: Literal["paper", "devices", "state"] = OBSERVATION_OF[agent.config.network.kind]
 
@@ -79,7 +80,13 @@ class AgentPolicy:
         """Nothing is remembered between steps."""
 
     def act(self, observation: Any, *, generator: np.random.Generator, deterministic: bool = False) -> FlightAction:
-        """One action a flight; its torch generator is seeded from `generator`."""
+        """One action a flight; its torch generator is seeded from `generator`.
+
+        Raises:
+            ConfigError: `deterministic`, and candidates were asked for, of which there is only one then.
+        """
+        if deterministic and self.decision.candidates is not None:
+            raise ConfigError(f"policy '{self.name}' has candidates to choose from, allowed: without --deterministic")
         device = next(self.agent.networks.parameters()).device
         draws = torch.Generator(device).manual_seed(int(generator.integers(2**62)))
         action = self.agent.act(to_tensors(observation, device), generator=draws, deterministic=deterministic)
@@ -150,7 +157,7 @@ def load_policy(path: Path, scenario: Scenario, decision: Decision = AS_TRAINED)
         )
     decision.apply(agent)
     name = str(checkpoint.document.get("agent", place.name))
-    return AgentPolicy(name, agent, scenario)
+    return AgentPolicy(name, agent, scenario, decision)
 
 
 def trained_scenario(path: Path) -> Scenario:
