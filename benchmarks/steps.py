@@ -28,20 +28,19 @@ from matplotlib.figure import Figure
 from uavrl.agents.registry import changed, make_agent, preset
 from uavrl.benchmarks.decide import decision
 from uavrl.benchmarks.timing import machine
-from uavrl.evaluation.metrics import flight_metrics
 from uavrl.evaluation.report import write_json, write_text
 from uavrl.evaluation.rollouts import EvaluationSet, evaluation_set, fly
-from uavrl.evaluation.statistics import Estimate, excess_cost, over_seeds, unit_means
+from uavrl.evaluation.statistics import Estimate, excess_cost, over_seeds
+from uavrl.experiments.flights import kept
 from uavrl.experiments.paper import ALGORITHMS, CHEAPER, PROTOCOLS, SCALES, YARDSTICK, Plan
-from uavrl.experiments.runner import finished
+from uavrl.experiments.runner import append, finished
 from uavrl.experiments.tables import estimated, interval, markdown
 from uavrl.scenario import Scenario, load_scenario
 from uavrl.training.batches import spaces_of
 from uavrl.training.policy import Decision, load_policy
 
 SEEDS = (0, 1, 2, 3, 4)
-EPISODES, FADINGS = 100, 3
-KEPT = ("return", "age_per_step_s", "age_per_second_s", "energy_per_step_j", "duration_s", "steps")
+EPISODES, FADINGS = SCALES["standard"].episodes, SCALES["standard"].fading_seeds
 TIMED_S = 3.0
 
 
@@ -91,30 +90,21 @@ def environments(scenario: Scenario) -> EvaluationSet:
 def flown(runs: Path, way: Way, seed: int, scenario: Scenario) -> dict[str, Any]:
     """Metrics of each environment, means over its fadings."""
     policy = load_policy(runs / f"{way.run}-{seed}", scenario, way.decision)
-    metrics = flight_metrics(fly(policy, environments(scenario), deterministic=way.deterministic))
-    unit = np.repeat(np.arange(EPISODES), FADINGS)
-    return {name: [float(f"{value:.5g}") for value in unit_means(metrics[name], unit)] for name in KEPT}
+    return kept(fly(policy, environments(scenario), deterministic=way.deterministic))
 
 
 def keep(out: Path, rows: list[tuple[Way, int, str, Scenario]], runs: Path) -> None:
     """Fly what OUT/steps.jsonl lacks; a row is named by way, seed and what it was charged."""
     out.mkdir(parents=True, exist_ok=True)
     store = out / "steps.jsonl"
-    done = {(row["way"], row["seed"], row["charged"], row["decision_s"]) for row in stored(store)}
+    done = finished(store)
     for way, seed, charged, scenario in rows:
-        if (way.name, seed, charged, scenario.airframe.decision_s) in done:
-            continue
-        row = {"way": way.name, "seed": seed, "charged": charged, "decision_s": scenario.airframe.decision_s}
-        line = json.dumps(row | {"flown": flown(runs, way, seed, scenario), "machine": machine()})
-        with store.open("a", encoding="utf-8") as file:
-            file.write(line + "\n")
-        print(f"{way.name}, seed {seed}, {charged}", flush=True)
-
-
-def stored(store: Path) -> list[dict[str, Any]]:
-    """Its rows; a last line that was cut short does not count."""
-    lines = store.read_text(encoding="utf-8").splitlines() if store.exists() else []
-    return [json.loads(line) for line in lines if line.endswith("}")]
+        decision_s = scenario.airframe.decision_s
+        key = f"{way.name}, seed {seed}, {charged or 'as in the scenario'}, {decision_s:.6g} s"
+        if key not in done:
+            row = {"key": key, "way": way.name, "seed": seed, "charged": charged, "decision_s": decision_s}
+            append(store, row | {"flown": flown(runs, way, seed, scenario), "machine": machine()})
+            print(key, flush=True)
 
 
 def times(runs: Path, out: Path) -> None:
@@ -155,7 +145,10 @@ def gathered(rows: Sequence[dict[str, Any]], way: str, metric: str, charged: str
 
 def tables(out: Path, comparison: Path) -> None:
     """Write both tables and the figure."""
-    rows, known = stored(out / "steps.jsonl"), json.loads((out / "steps-times.json").read_text(encoding="utf-8"))
+    rows, known = (
+        [*finished(out / "steps.jsonl").values()],
+        json.loads((out / "steps-times.json").read_text(encoding="utf-8")),
+    )
     beside = _beside(comparison)
     planner = estimated(beside[YARDSTICK])
     # one name for all: ways of a seed's teacher and student share its luck, so seeds are resampled together

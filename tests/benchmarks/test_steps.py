@@ -10,6 +10,7 @@ from benchmarks import steps
 from tests.training.test_policy import saved
 from uavrl.experiments.flights import Setting
 from uavrl.experiments.paper import ALGORITHMS, PROTOCOLS, SCALES, YARDSTICK, Plan
+from uavrl.experiments.runner import finished
 from uavrl.scenario import load_scenario
 
 SHORT = load_scenario("released", max_steps=6)
@@ -40,7 +41,7 @@ def test_every_way_is_flown_once_in_the_comparisons_environments(runs: Path) -> 
     assert (runs / "out" / "steps.jsonl").read_text() == first
     with (runs / "out" / "steps.jsonl").open("a") as file:
         file.write('{"way": "cut sh')
-    assert len(steps.stored(runs / "out" / "steps.jsonl")) == len(rows)
+    assert len(finished(runs / "out" / "steps.jsonl")) == len(rows)
 
 
 def test_the_environments_are_the_comparisons() -> None:
@@ -72,6 +73,7 @@ def test_the_table_sets_cost_beside_time(runs: Path, monkeypatch: pytest.MonkeyP
     def written(way: str, values: list[float]) -> list[dict[str, Any]]:
         return [
             {
+                "key": f"{way} {seed}",
                 "way": way,
                 "seed": seed,
                 "charged": "",

@@ -17,7 +17,7 @@ from uavrl.agents.sac import SacConfig
 from uavrl.datasets import Quality, Transitions, load_source, relabelled, select
 from uavrl.errors import DivergenceError
 from uavrl.evaluation.metrics import flight_metrics
-from uavrl.evaluation.rollouts import EVALUATION_SEED, EvaluationSet, evaluation_set, fly
+from uavrl.evaluation.rollouts import EVALUATION_SEED, EvaluationSet, Flights, evaluation_set, fly
 from uavrl.evaluation.statistics import unit_means
 from uavrl.experiments.runner import Row, Run, Scores
 from uavrl.policies import make_policy
@@ -106,13 +106,18 @@ def measure(run: Run, directory: Path) -> Scores:
     else:
         policy, scores = _learn_offline(run, setting, directory)
     flown = fly(policy, setting.environments(setting.fading_seeds), deterministic=setting.deterministic)
-    unit = np.repeat(np.arange(setting.episodes), setting.fading_seeds)
-    metrics = {name: _short(unit_means(values, unit)) for name, values in flight_metrics(flown).items() if name in KEPT}
-    scores |= {"flown": metrics, "decision_ms": _short(np.array([np.median(flown.latency_s) * 1e3]))[0]}
+    scores |= {"flown": kept(flown), "decision_ms": _short(np.array([np.median(flown.latency_s) * 1e3]))[0]}
     if run.problem != "policy":
         other = fly(policy, setting.environments(1), deterministic=not setting.deterministic)
         scores["other_return"] = _short(flight_metrics(other)["return"])
     return scores
+
+
+def kept(flights: Flights) -> dict[str, list[float | None]]:
+    """The metrics of `KEPT`: a number an environment, the mean over its fading repeats."""
+    environments = flights.evaluation_set
+    unit = np.arange(environments.flights) // environments.fading_seeds
+    return {name: _short(unit_means(values, unit)) for name, values in flight_metrics(flights).items() if name in KEPT}
 
 
 def _learn_offline(run: Run, setting: Setting, directory: Path) -> tuple[Policy, Scores]:

@@ -107,7 +107,7 @@ def run_all(
     for run, (scores, seconds, where) in ended if places else ():
         row = {"key": run.key, **run.model_dump(mode="json"), "scores": scores, "seconds": round(seconds, 1)}
         row["machine"] = where
-        _append(store, row)
+        append(store, row)
         rows[run.key] = row
         shutil.rmtree(unfinished / run.key, ignore_errors=True)
         done += 1
@@ -152,7 +152,7 @@ def _on_cluster(places: Sequence[tuple[Run, Path]], function: Function, address:
         ray.shutdown()  # leaves the cluster; the runs that it was doing for us end
 
 
-def _append(store: Path, row: dict[str, Any]) -> None:
+def append(store: Path, row: dict[str, Any]) -> None:
     """One line in one write, on disk when this returns; begun afresh where a killed writer left half a line."""
     broken = store.exists() and store.stat().st_size > 0 and not store.read_bytes().endswith(b"\n")
     with store.open("a", encoding="utf-8") as file:
