@@ -26,7 +26,7 @@ import torch
 from matplotlib.figure import Figure
 
 from uavrl.agents.registry import changed, make_agent, preset
-from uavrl.benchmarks.decide import decision
+from uavrl.benchmarks.decide import Exported
 from uavrl.benchmarks.timing import machine
 from uavrl.evaluation.report import write_json, write_text
 from uavrl.evaluation.rollouts import EvaluationSet, evaluation_set, fly
@@ -41,7 +41,7 @@ from uavrl.training.policy import Decision, load_policy
 
 SEEDS = (0, 1, 2, 3, 4)
 EPISODES, FADINGS = SCALES["standard"].episodes, SCALES["standard"].fading_seeds
-TIMED_S = 3.0
+ROUNDS, ROUND_S = 10, 0.5
 
 
 class Way(NamedTuple):
@@ -108,23 +108,24 @@ def keep(out: Path, rows: list[tuple[Way, int, str, Scenario]], runs: Path) -> N
 
 
 def times(runs: Path, out: Path) -> None:
-    """Of each way with seed 0, exported; and of the algorithms beside it, untrained, which changes no time."""
-    scenario, file = load_scenario("released"), out / "steps-times.json"
-    found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {"machine": machine()}
+    """Of each way with seed 0, exported; and of the algorithms beside it, untrained, which changes no time.
+
+    In rounds, since a machine's speed sways: each round times every one of them.
+    """
+    scenario = load_scenario("released")
+    files: dict[str, Exported] = {}
     for name, way in WAYS.items():
-        if f"{name}_ms" not in found:
-            agent = load_policy(runs / f"{way.run}-0", scenario, way.decision).agent
-            found |= decision(name, agent, scenario, TIMED_S, sampled=not way.deterministic)
-            write_json(file, found)
-            print(f"{name}: {found[f'{name}_ms']:.3g} ms", flush=True)
+        agent = load_policy(runs / f"{way.run}-0", scenario, way.decision).agent
+        files[name] = Exported(agent, scenario, sampled=not way.deterministic)
     for name, agent_name in ALGORITHMS.items():
-        if f"{name}_ms" not in found:
-            config = changed(preset(agent_name, "default"), CHEAPER.get(name, {}))
-            agent = make_agent(spaces_of(scenario, config.network.kind), config)
-            sampled = not PROTOCOLS["layouts"].deterministic(name)
-            found |= decision(name, agent, scenario, TIMED_S, sampled=sampled)
-            write_json(file, found)
-            print(f"{name}: {found[f'{name}_ms']:.3g} ms", flush=True)
+        config = changed(preset(agent_name, "default"), CHEAPER.get(name, {}))
+        agent = make_agent(spaces_of(scenario, config.network.kind), config)
+        files[name] = Exported(agent, scenario, sampled=not PROTOCOLS["layouts"].deterministic(name))
+    rounds = [{name: file.times_s(ROUND_S) for name, file in files.items()} for _ in range(ROUNDS)]
+    found: dict[str, Any] = {"machine": machine()}
+    for name, file in files.items():
+        found |= file.figures(name, np.concatenate([each[name] for each in rounds]), ROUND_S)
+    write_json(out / "steps-times.json", found)
 
 
 def charges(out: Path) -> Iterator[tuple[Way, str, Scenario]]:

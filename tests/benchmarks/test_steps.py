@@ -53,6 +53,20 @@ def test_the_environments_are_the_comparisons() -> None:
     assert (found.start_m == expected.start_m).all()
 
 
+def test_every_way_and_algorithm_is_timed(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(steps, "WAYS", {"DDIM, 2": steps.WAYS["DDIM, 2"]})
+    monkeypatch.setattr(steps, "ALGORITHMS", {"IQL": "iql"})
+    monkeypatch.setattr(steps, "ROUND_S", 0.02)
+    monkeypatch.setattr(steps, "ROUNDS", 2)
+    (runs / "out").mkdir()
+    steps.main("time", str(runs), str(runs / "out"))
+    found = json.loads((runs / "out" / "steps-times.json").read_text())
+    for name in ("DDIM, 2", "IQL"):
+        assert 0 < found[f"{name}_ms"] <= found[f"{name}_p99_ms"]
+        assert found[f"{name}_floor_ms"] > 0
+        assert found[f"{name}_batch_decisions_per_s"] > 1e3 / found[f"{name}_ms"]
+
+
 def test_a_decision_that_takes_longer_is_charged_to_the_flight(runs: Path) -> None:
     out = runs / "out"
     out.mkdir()

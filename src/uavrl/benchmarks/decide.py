@@ -84,7 +84,7 @@ def floor_s(products: Products, each_s: float) -> float:
 
 
 def measure(name: str, seconds: float, scenario: Scenario | None = None) -> dict[str, float]:
-    """`decision` of one of `CASES`, untrained, which changes no time."""
+    """`Exported.figures` of one of `CASES`, untrained, which changes no time."""
     scenario = load_scenario("released") if scenario is None else scenario
     config = settings(CASES[name])
     state = torch.random.get_rng_state()
@@ -92,40 +92,50 @@ def measure(name: str, seconds: float, scenario: Scenario | None = None) -> dict
     torch.random.set_rng_state(state)
     logged, _ = load_builtin("layouts").observations(OBSERVATION_OF[config.network.kind], scenario)
     fit_normalisers(agent.networks, to_tensors(logged))
-    return decision(name, agent, scenario, seconds)
+    exported = Exported(agent, scenario)
+    return exported.figures(name, exported.times_s(seconds), seconds)
 
 
-def decision(name: str, agent: Agent, scenario: Scenario, seconds: float, *, sampled: bool = False) -> dict[str, float]:
-    """Milliseconds of `Policy.decide` for one aircraft, of its floor, and decisions a second for `AIRCRAFT` at once.
-
-    The floor is the products of one decision with each of the network's matrices, one after another.
+class Exported:
+    """An agent's file, loaded, beside logged observations that it decides on.
 
     Args:
-        name: prefix of the keys.
-        agent: is exported and decides on logged observations.
+        agent: is exported.
         scenario: of the observations.
-        seconds: that each time and rate is measured for.
         sampled: its samples, drawing the noise included; else its deterministic action.
     """
-    logged, _ = load_builtin("layouts").observations(OBSERVATION_OF[agent.config.network.kind], scenario)
-    with tempfile.TemporaryDirectory() as folder:
-        export(agent, scenario, Path(folder) / "policy.onnx", sampled=sampled)
-        policy = Policy(Path(folder) / "policy.onnx")
 
-    def rows(index: slice | int) -> Any:
-        return {key: value[index] for key, value in logged.items()} if isinstance(logged, dict) else logged[index]
+    def __init__(self, agent: Agent, scenario: Scenario, *, sampled: bool = False) -> None:
+        self.agent, self.sampled = agent, sampled
+        self.logged, _ = load_builtin("layouts").observations(OBSERVATION_OF[agent.config.network.kind], scenario)
+        with tempfile.TemporaryDirectory() as folder:
+            export(agent, scenario, Path(folder) / "policy.onnx", sampled=sampled)
+            self.policy = Policy(Path(folder) / "policy.onnx")
+        self.count = len(next(iter(self.logged.values())) if isinstance(self.logged, dict) else self.logged)
 
-    count = len(next(iter(logged.values())) if isinstance(logged, dict) else logged)
-    singles = [rows(index) for index in range(min(count, 1000))]
-    taken = times_s(lambda index: policy.decide(singles[index % len(singles)]), seconds)
-    products, noise = Products(), torch.zeros((1, *agent.noise_shape(agent.spaces.choices)))
-    with products, torch.no_grad():
-        agent.decide(to_tensors(rows(slice(0, 1))), noise if sampled else None)
-    many = rows(slice(0, AIRCRAFT))
-    batch = rate(lambda: policy.decide(many), work=min(count, AIRCRAFT), seconds=seconds, repeats=3)
-    return {
-        f"{name}_ms": 1e3 * float(np.median(taken)),
-        f"{name}_p99_ms": 1e3 * float(np.percentile(taken, 99)),
-        f"{name}_floor_ms": 1e3 * floor_s(products, min(0.1, seconds)),
-        **batch.named(f"{name}_batch_decisions"),
-    }
+    def _rows(self, index: slice | int) -> Any:
+        if isinstance(self.logged, dict):
+            return {key: value[index] for key, value in self.logged.items()}
+        return self.logged[index]
+
+    def times_s(self, seconds: float) -> NDArray[np.float64]:
+        """Of `Policy.decide` for one aircraft (n,), for about `seconds`."""
+        singles = [self._rows(index) for index in range(min(self.count, 1000))]
+        return times_s(lambda index: self.policy.decide(singles[index % len(singles)]), seconds)
+
+    def figures(self, name: str, taken_s: NDArray[np.float64], seconds: float) -> dict[str, float]:
+        """Milliseconds of `taken_s` and the floor, decisions a second for `AIRCRAFT` at once; `name` opens the keys.
+
+        The floor is the products of one decision with each of the network's matrices, one after another.
+        """
+        products, noise = Products(), torch.zeros((1, *self.agent.noise_shape(self.agent.spaces.choices)))
+        with products, torch.no_grad():
+            self.agent.decide(to_tensors(self._rows(slice(0, 1))), noise if self.sampled else None)
+        many = self._rows(slice(0, AIRCRAFT))
+        batch = rate(lambda: self.policy.decide(many), work=min(self.count, AIRCRAFT), seconds=seconds, repeats=3)
+        return {
+            f"{name}_ms": 1e3 * float(np.median(taken_s)),
+            f"{name}_p99_ms": 1e3 * float(np.percentile(taken_s, 99)),
+            f"{name}_floor_ms": 1e3 * floor_s(products, min(0.1, seconds)),
+            **batch.named(f"{name}_batch_decisions"),
+        }
