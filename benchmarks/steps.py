@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, NullLocator
 
 from uavrl.agents.registry import changed, make_agent, preset
 from uavrl.benchmarks.decide import Exported
@@ -73,12 +74,12 @@ TEACHER = "DDIM, 50"
 CHARGED = ("one-step student", "DDIM, 1", "DDIM, 5", TEACHER)
 SLOWER = {"this machine": 1.0, "ten times slower": 10.0}  # of machines
 
-FAMILIES = {  # of the figure: colour, marker, line
-    "one-step student": ("#D55E00", "D", ""),
-    "DDIM": ("#0072B2", "o", "-"),
-    "DPM-Solver++(2M)": ("#009E73", "s", "-"),
-    "samples": ("#56B4E9", "^", ""),
-    "other algorithms": ("#000000", "X", ""),
+FAMILIES = {  # of the figure: colour, marker, line, where the note stands: over or under the interval
+    "one-step student": ("#D55E00", "D", "", True),
+    "DDIM": ("#0072B2", "o", "-", True),
+    "DPM-Solver++(2M)": ("#009E73", "s", "-", False),
+    "samples": ("#56B4E9", "^", "", True),
+    "other algorithms": ("#000000", "X", "", False),
 }
 
 
@@ -207,9 +208,9 @@ def _charged_table(rows: Sequence[dict[str, Any]]) -> list[list[str]]:
 
 def _figure(points: dict[str, tuple[float, Estimate]], path: Path) -> None:
     """Excess cost over decision time."""
-    figure = Figure(figsize=(7.16, 3.6), layout="constrained")
+    figure = Figure(figsize=(7.16, 4.2), layout="constrained")
     axes = figure.subplots()
-    for label, (colour, marker, line) in FAMILIES.items():
+    for label, (colour, marker, line, over) in FAMILIES.items():
         own = {name: point for name, point in points.items() if _family(name) == label}
         x = np.array([time for time, _ in own.values()])
         found = [100.0 * np.array(excess.interval()) for _, excess in own.values()]
@@ -218,10 +219,17 @@ def _figure(points: dict[str, tuple[float, Estimate]], path: Path) -> None:
             x, y, yerr=[y - low, high - y], color=colour, marker=marker, linestyle=line, markersize=4, capsize=2,
             linewidth=0.9, label=label,
         )  # fmt: skip
-        for name, time, height in zip(own, x, y, strict=True):
-            if note := _note(name):
-                axes.annotate(note, (time, height), xytext=(4, 3), textcoords="offset points", fontsize=6)
-    axes.set(xscale="log", xlabel="time of a decision, median (ms)", ylabel="cost over the planner (%)")
+        for name, time, end in zip(own, x, high if over else low, strict=True):
+            axes.annotate(
+                _note(name), (time, end), xytext=(0, 3 if over else -3), textcoords="offset points", fontsize=6,
+                color=colour, ha="center", va="bottom" if over else "top",
+            )  # fmt: skip
+    axes.set(xscale="log", yscale="log", xlabel="time of a decision, median (ms)", ylabel="cost over the planner (%)")
+    axes.set(xlim=(0.08, 3.5), yticks=(10, 15, 20, 30, 40, 60))
+    axes.xaxis.set_major_locator(FixedLocator([0.1, 0.2, 0.5, 1.0, 2.0]))
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_locator(NullLocator())
     axes.grid(visible=True, alpha=0.3, linewidth=0.5)
     axes.legend(fontsize=7)
     figure.savefig(path, dpi=200)
