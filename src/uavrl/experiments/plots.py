@@ -151,16 +151,21 @@ def _chosen(points: Sequence[Point], **wanted: Any) -> list[Point]:
 
 def _references(axes: Axes, points: Sequence[Point], metric: str, low: float, high: float) -> list[str]:
     """Dashed lines of what needs no learning, named at an end; those outside [low, high] are returned as text."""
-    outside, side, last = [], 1, None
+    outside: list[str] = []
+    close: list[list[Point]] = []  # lines, from above, whose names would cover each other
     for point in sorted(_chosen(points, metric=metric, seeds=0), key=lambda point: -point["mean"]):
         if not low <= point["mean"] <= high:
             outside.append(f"{point['name']} {point['mean']:,.4g}")
             continue
-        near = last is not None and last - point["mean"] < 0.07 * (high - low)
-        side, last = 1 - side if near else 1, point["mean"]  # of two lines close together each has its own end
         axes.axhline(point["mean"], color="#777777", linestyle=(0, (4, 2)), linewidth=0.8, zorder=1)
+        if close and close[-1][-1]["mean"] - point["mean"] < 0.07 * (high - low):
+            close[-1].append(point)
+        else:
+            close.append([point])
+    for group in close:
+        names = ", ".join(point["name"] for point in group)
         place: Any = {"xycoords": axes.get_yaxis_transform(), "fontsize": 6, "color": "#555555", "va": "bottom"}
-        axes.annotate(point["name"], (0.995 if side else 0.005, point["mean"]), ha="right" if side else "left", **place)
+        axes.annotate(names, (0.995, group[0]["mean"]), ha="right", **place)
     return outside
 
 
