@@ -1,8 +1,9 @@
 """Whose part is the excess: a critic's policy with the hover heuristic's moves, and with its choice of device.
 
-    python -m benchmarks.parts [--planner] runs/layouts [MORE ...]
+    python -m benchmarks.parts [--planner] [--held=40] runs/layouts [MORE ...]
 
-The planner's line takes minutes. On trial flights of preset `released`, which no evaluation uses. The tables in
+The planner's line takes minutes. With --held=N every policy's flights are shown, too, with N steps before them in which
+the aircraft holds its place and idles. On trial flights of preset `released`, which no evaluation uses. The tables in
 docs/what-matters.md are made of such.
 """
 
@@ -56,6 +57,30 @@ class Swapped:
         return FlightAction(known.displacement_m, best_device(self.policy, seen, known.displacement_m)[0])
 
 
+class Held:
+    """A policy that takes over after some steps of holding the place and serving nobody."""
+
+    needs: Literal["paper", "devices", "state"] = "state"
+
+    def __init__(self, policy: Policy, steps: int) -> None:
+        self.policy, self.steps, self.name = policy, steps, f"{policy.name} after {steps}"
+
+    def reset(self, count: int) -> None:
+        """Of the policy and of the steps."""
+        self.policy.reset(count)
+        self.step = 0
+
+    def act(self, observation: Any, *, generator: np.random.Generator, deterministic: bool = False) -> FlightAction:
+        """Nothing, or what the policy does."""
+        self.step += 1
+        if self.step <= self.steps:
+            flights = len(observation.layout_m)
+            return FlightAction(np.zeros((flights, 2)), np.zeros(flights, dtype=np.int64))
+        if self.policy.needs != "state":
+            observation = observe(self.policy.needs, observation.scenario, observation.layout_m, observation.state)
+        return self.policy.act(observation, generator=generator, deterministic=deterministic)
+
+
 def best_device(policy: AgentPolicy, seen: Any, displacement_m: NDArray[np.float64]) -> tuple[Any, Any]:
     """(device, min Q), each (N,): what the critic would choose beside given moves (N, 2), and what it thinks of it."""
     critic = cast(DiffusionSac, policy.agent).critic
@@ -98,12 +123,18 @@ def main(paths: list[str]) -> None:
     columns = ("policy", "return", "median", f"steps 1-{EARLY}", f"idle, first {LATER} steps, %", "idle after, %")
     print(f"| {' | '.join(columns)} | flights that idle on, % |")
     print("|---" * 7 + "|")
-    known = ["hover", "planner"] if "--planner" in paths else ["hover"]
-    for name in known:
-        print(line(name, fly(make_policy(name), trial)), flush=True)
-    for path in (path for path in paths if path != "--planner"):
+    held = [int(one.removeprefix("--held=")) for one in paths if one.startswith("--held=")]
+
+    def show(name: str, policy: Policy) -> None:
+        print(line(name, fly(policy, trial, deterministic=True)), flush=True)
+        for steps in held:
+            print(line(f"- after {steps} steps of holding", fly(Held(policy, steps), trial, deterministic=True)))
+
+    for name in ["hover", "planner"] if "--planner" in paths else ["hover"]:
+        show(name, make_policy(name))
+    for path in (path for path in paths if not path.startswith("--")):
         policy = learned(Path(path))
-        print(line(path, fly(policy, trial, deterministic=True)))
+        show(path, policy)
         print(line("- hover's moves, its devices", fly(Swapped(policy, "hover's"), trial)))
         print(line("- its moves, hover's devices", fly(Swapped(policy, "own"), trial)), flush=True)
 

@@ -40,3 +40,13 @@ def test_a_line_counts_flown_steps_only(monkeypatch: pytest.MonkeyPatch) -> None
     made: Any = SimpleNamespace(reward=reward, active=active, device=device)
     # returns -110 and -220, +-1.96 * 77.8 / sqrt 2; the first fifty steps -50 and -100
     assert parts.line("made", made) == "| made | -165 \u00b1 108 | -165 | -75 | 5.0 | 25.0 | 50 |"
+
+
+def test_a_policy_takes_over_after_the_steps_of_holding(learned: AgentPolicy) -> None:
+    trial = evaluation_set(SCENARIO, "random", 4, seed=3)
+    held = fly(parts.Held(learned, 5), trial, deterministic=True)
+    assert (held.device[:5] == 0).all()
+    np.testing.assert_array_equal(held.position_m[5], held.position_m[0])
+    own = fly(learned, trial, deterministic=True)
+    assert (held.position_m[6] != held.position_m[5]).any()
+    np.testing.assert_array_equal(fly(parts.Held(learned, 0), trial, deterministic=True).reward, own.reward)
