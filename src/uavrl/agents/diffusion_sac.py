@@ -11,7 +11,7 @@ where [w, z] is what the denoising chain returns. The guidance must reach the ac
 and for z alike: an argmax or a sampler without graph would leave nothing but behaviour cloning.
 
 Beyond the paper: `action_noise` on w in the backup and in L_g, `pinned_level` and `greedy_choice` in the backup, the
-penalty over choices alone.
+penalty over choices alone, the null action among a decision's candidates.
 """
 
 from __future__ import annotations
@@ -107,6 +107,11 @@ class DiffusionSacConfig(AgentConfig):
         "(paper). The critic knows every choice from one pass, and the data hold all of them, some rarely",
     )
     candidates: int = Field(1, ge=1, description="actions drawn at a decision; the one of largest min Q is taken")
+    null_candidate: bool = Field(
+        False,
+        description="beside them stands the null action, w = 0 with choice 0 (hold the place, serve nobody): no network "
+        "hits exactly 0, and of a move's cost the first metre is as dear as the last. Not in the backup",
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -308,14 +313,20 @@ class DiffusionSac(Agent):
 
     def best(self, observation: Observation, drawn: HybridAction, count: int) -> HybridAction:
         """Of each row's `count` drawn actions, one after another, that of largest min Q; its choice as configured."""
-        if count == 1 and not self.config.greedy_choice:
+        config = self.config
+        if count == 1 and not config.greedy_choice and not config.null_candidate:
             return drawn
-        q, choice = self._best(self.critic, repeat(self.critic.encode(observation), count), drawn)
-        if count == 1:
-            return HybridAction(drawn.continuous, choice)
-        rows = q.shape[0] // count
-        best = q.view(rows, count).argmax(dim=1) + count * torch.arange(rows, device=q.device)
-        return HybridAction(drawn.continuous[best], choice[best])
+        context, w = self.critic.encode(observation), drawn.continuous
+        q, choice = self._best(self.critic, repeat(context, count), drawn)
+        if count > 1:
+            rows = q.shape[0] // count
+            best = q.view(rows, count).argmax(dim=1) + count * torch.arange(rows, device=q.device)
+            q, w, choice = q[best], w[best], choice[best]
+        if config.null_candidate:
+            null_q = self.critic.all_choices(context, torch.zeros_like(w)).amin(dim=0)[:, 0]
+            acts = q >= null_q
+            w, choice = w * acts[:, None], choice * acts
+        return HybridAction(w, choice)
 
     def noise_now(self) -> float:
         """Standard deviation of the action noise at this share of the training."""
