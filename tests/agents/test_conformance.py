@@ -127,7 +127,12 @@ def test_a_padded_device_is_never_chosen(name: str, deterministic: bool) -> None
     seen = observation("devices", 200)
     assert isinstance(seen, dict)
     seen["devices"][:, 1, 5] = 0.0
-    settings = [{"candidates": 1, "greedy_choice": False}, {"candidates": 3, "greedy_choice": False}, {"candidates": 2}]
+    settings: list[dict[str, Any]] = [
+        {"candidates": 1, "greedy_choice": False},
+        {"candidates": 3, "greedy_choice": False},
+        {"candidates": 2},
+        {"null_candidate": True},
+    ]
     for changes in settings if name == "diffusion_sac" else [{}]:
         made = agent(name, "devices", **changes)
         action = made.act(seen, generator=generator(), deterministic=deterministic)
@@ -256,6 +261,28 @@ def test_a_greedy_choice_is_the_critics_best_for_the_actors_displacement(kind: K
             best = critic.all_choices(critic.encode(seen), greedy.continuous).amin(dim=0).argmax(dim=1)
         assert torch.equal(greedy.choice, best)
         assert not torch.equal(own.choice, best)
+
+
+@pytest.mark.parametrize("settings", [{}, {"greedy_choice": False}, {"candidates": 3}])
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_null_action_is_taken_where_the_critic_finds_it_better(kind: Kind, settings: dict[str, Any]) -> None:
+    seen = observation(kind, 200)
+    without = diffusion_sac(kind, **settings)
+    made = diffusion_sac(kind, **settings, null_candidate=True)
+    for one in (without, made):
+        disturb(one.critic, 3)
+    acted, action = (one.act(seen, generator=generator(1)) for one in (without, made))
+    with torch.no_grad():
+        critic = made.critic
+        context = critic.encode(seen)
+        own = critic.all_choices(context, acted.continuous).amin(dim=0).gather(1, acted.choice[:, None])[:, 0]
+        null = critic.all_choices(context, torch.zeros(200, 2)).amin(dim=0)[:, 0]
+    holds = null > own
+    assert 0 < holds.sum() < 200
+    assert (action.choice[holds] == 0).all()
+    assert (action.continuous[holds] == 0).all()
+    assert torch.equal(action.choice[~holds], acted.choice[~holds])
+    assert torch.equal(action.continuous[~holds], acted.continuous[~holds])
 
 
 def test_the_average_acts_not_the_network_in_training() -> None:

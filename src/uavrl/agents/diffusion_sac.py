@@ -109,8 +109,8 @@ class DiffusionSacConfig(AgentConfig):
     candidates: int = Field(1, ge=1, description="actions drawn at a decision; the one of largest min Q is taken")
     null_candidate: bool = Field(
         False,
-        description="beside them stands the null action, w = 0 with choice 0 (hold the place, serve nobody): no network "
-        "hits exactly 0, and of a move's cost the first metre is as dear as the last. Not in the backup",
+        description="beside them stands the null action, w = 0 with choice 0 (hold the place, serve nobody), which no "
+        "network hits: of a move's cost the first metre is as dear as the last. Not in the backup",
     )
 
     @model_validator(mode="after")
