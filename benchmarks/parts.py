@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from uavrl.agents.diffusion_sac import DiffusionSac
+from uavrl.cli.policies import checkpoint_and_decision
 from uavrl.evaluation.rollouts import TRIAL_SEED, Flights, evaluation_set, fly
 from uavrl.policies import make_policy
 from uavrl.policies.base import Policy
@@ -105,10 +106,11 @@ def line(name: str, flights: Flights) -> str:
     )
 
 
-def learned(path: Path) -> AgentPolicy:
+def learned(spec: str | Path) -> AgentPolicy:
     """A checkpoint's policy, whose critic knows every choice; stops where it is another."""
     scenario = load_scenario("released")
-    policy = load_policy(path, scenario)
+    path, decision = checkpoint_and_decision(str(spec))
+    policy = load_policy(path, scenario, decision)
     known = isinstance(policy.agent, DiffusionSac) and policy.needs == "devices"
     if not known or trained_scenario(path) != scenario:
         sys.exit(f"{path}: allowed here: Diffusion-SAC with a set network, trained in preset 'released'")
@@ -133,7 +135,7 @@ def main(paths: list[str]) -> None:
     for name in ["hover", "planner"] if "--planner" in paths else ["hover"]:
         show(name, make_policy(name))
     for path in (path for path in paths if not path.startswith("--")):
-        policy = learned(Path(path))
+        policy = learned(path)
         show(path, policy)
         print(line("- hover's moves, its devices", fly(Swapped(policy, "hover's"), trial)))
         print(line("- its moves, hover's devices", fly(Swapped(policy, "own"), trial)), flush=True)

@@ -70,9 +70,13 @@ def test_a_decision_is_changed_at_loading_where_the_agent_can(tmp_path: Path) ->
     assert load_policy(tmp_path / "sac", SCENARIO, Decision(solver="ddim")).agent.noise_shape(5) == (1, 7)
     with pytest.raises(ConfigError, match="steps = 6, allowed: 1 to 5, those of the chain as it was trained"):
         load_policy(tmp_path / "sac", SCENARIO, Decision(solver="dpm", steps=6))
+    held = load_policy(tmp_path / "sac", SCENARIO, Decision(null_candidate=True)).agent
+    assert held.config.null_candidate  # type: ignore[attr-defined]  # of this agent
     saved(tmp_path / "iql", "iql", "devices")
     with pytest.raises(ConfigError, match="candidates = 4, allowed for agents that re-rank; iql does not"):
         load_policy(tmp_path / "iql", SCENARIO, Decision(candidates=4))
+    with pytest.raises(ConfigError, match="null_candidate = False, allowed for agents that re-rank; iql does not"):
+        load_policy(tmp_path / "iql", SCENARIO, Decision(null_candidate=False))
     with pytest.raises(ConfigError, match="solver = 'ddim', allowed for agents with a chain; iql has none"):
         load_policy(tmp_path / "iql", SCENARIO, Decision(solver="ddim"))
 

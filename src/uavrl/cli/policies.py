@@ -48,7 +48,8 @@ def resolve(spec: str, scenario: Scenario) -> Policy:
         return _import(spec, scenario)
     raise ConfigError(
         f"policy '{spec}' does not exist, allowed: {', '.join(POLICIES)}, the directory of a checkpoint, "
-        "pretrained:NAME, either with @candidates=N,solver=ddim|dpm,steps=N, an .onnx file, module:Class"
+        "pretrained:NAME, either with @candidates=N,null_candidate=true|false,solver=ddim|dpm,steps=N, an .onnx file, "
+        "module:Class"
     )
 
 
@@ -66,7 +67,8 @@ def checkpoint_and_decision(spec: str) -> tuple[Path, Decision]:
         name, equals, value = setting.partition("=")
         if not equals or name not in Decision.model_fields or name in values:
             raise ConfigError(
-                f"policy '{spec}': '{setting}', allowed: candidates=N, solver=ddim|dpm, steps=N, each once"
+                f"policy '{spec}': '{setting}', allowed: candidates=N, null_candidate=true|false, solver=ddim|dpm, "
+                "steps=N, each once"
             )
         values[name] = value
     try:

@@ -33,6 +33,7 @@ class Decision(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     candidates: int | None = Field(None, ge=1, description="actions drawn at a decision, for an agent that re-ranks")
+    null_candidate: bool | None = Field(None, description="whether holding the place, serving nobody, is among them")
     solver: SolverName | None = Field(None, description="ddim without noise, or dpm: DPM-Solver++(2M)")
     steps: int | None = Field(None, ge=1, description="of the solver, at most M; by default M")
 
@@ -49,10 +50,13 @@ class Decision(BaseModel):
             ConfigError: the agent has no such part, or a chain of fewer steps.
         """
         name = agent.config.name  # type: ignore[attr-defined]  # every agent's own config names it
-        if self.candidates is not None:
-            if not hasattr(agent.config, "candidates"):
-                raise ConfigError(f"candidates = {self.candidates}, allowed for agents that re-rank; {name} does not")
-            agent.config = agent.config.model_copy(update={"candidates": self.candidates})
+        for setting in ("candidates", "null_candidate"):
+            value = getattr(self, setting)
+            if value is None:
+                continue
+            if not hasattr(agent.config, setting):
+                raise ConfigError(f"{setting} = {value}, allowed for agents that re-rank; {name} does not")
+            agent.config = agent.config.model_copy(update={setting: value})
         if self.solver is not None:
             actor = getattr(agent, "actor", None)
             if not isinstance(actor, DiffusionActor):
