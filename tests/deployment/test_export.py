@@ -113,6 +113,16 @@ def test_parity_of_candidates_that_are_re_ranked(tmp_path: Path) -> None:
     agree(expected, Policy(tmp_path / "policy.onnx").decide(arrays(seen), drawn.numpy()))
 
 
+def test_parity_of_the_null_action(tmp_path: Path) -> None:
+    made = agent("diffusion_sac", "devices", null_candidate=True)
+    export(made, RELEASED, tmp_path / "policy.onnx")
+    seen = observation("devices", 500)
+    expected = made.act(seen, generator=torch.Generator(), deterministic=True)
+    held = ((expected.continuous == 0).all(dim=1) & (expected.choice == 0)).float().mean()
+    assert 0 < held < 1
+    agree(expected, Policy(tmp_path / "policy.onnx").decide(arrays(seen)))
+
+
 @pytest.mark.parametrize("sampled", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_parity_of_a_solver_with_fewer_steps(sampled: bool, tmp_path: Path) -> None:
     made = agent("diffusion_sac", "devices")
