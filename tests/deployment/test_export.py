@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 import uavrl
-from tests.agents.problems import KINDS, NAMES, Kind, agent, noise, observation
+from tests.agents.problems import KINDS, NAMES, Kind, agent, disturb, noise, observation
 from tests.deployment.conftest import Exported
 from uavrl.agents.base import Agent
 from uavrl.agents.diffusion_actor import ChainNoise, Solver
@@ -115,6 +115,8 @@ def test_parity_of_candidates_that_are_re_ranked(tmp_path: Path) -> None:
 
 def test_parity_of_the_null_action(tmp_path: Path) -> None:
     made = agent("diffusion_sac", "devices", null_candidate=True)
+    assert isinstance(made, DiffusionSac)
+    disturb(made.critic, 2, 0.1)
     export(made, RELEASED, tmp_path / "policy.onnx")
     seen = observation("devices", 500)
     expected = made.act(seen, generator=torch.Generator(), deterministic=True)
