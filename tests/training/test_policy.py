@@ -73,9 +73,9 @@ def test_a_decision_is_changed_at_loading_where_the_agent_can(tmp_path: Path) ->
     held = load_policy(tmp_path / "sac", SCENARIO, Decision(null_candidate=True)).agent
     assert held.config.null_candidate  # type: ignore[attr-defined]  # of this agent
     saved(tmp_path / "iql", "iql", "devices")
-    with pytest.raises(ConfigError, match="candidates = 4, allowed for agents that re-rank; iql does not"):
+    with pytest.raises(ConfigError, match="candidates = 4, allowed for agents that re-rank; not for iql"):
         load_policy(tmp_path / "iql", SCENARIO, Decision(candidates=4))
-    with pytest.raises(ConfigError, match="null_candidate = False, allowed for agents that re-rank; iql does not"):
+    with pytest.raises(ConfigError, match="null_candidate = False, allowed for Diffusion-SAC; not for iql"):
         load_policy(tmp_path / "iql", SCENARIO, Decision(null_candidate=False))
     with pytest.raises(ConfigError, match="solver = 'ddim', allowed for agents with a chain; iql has none"):
         load_policy(tmp_path / "iql", SCENARIO, Decision(solver="ddim"))

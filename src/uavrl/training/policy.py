@@ -50,12 +50,12 @@ class Decision(BaseModel):
             ConfigError: the agent has no such part, or a chain of fewer steps.
         """
         name = agent.config.name  # type: ignore[attr-defined]  # every agent's own config names it
-        for setting in ("candidates", "null_candidate"):
+        for setting, able in (("candidates", "agents that re-rank"), ("null_candidate", "Diffusion-SAC")):
             value = getattr(self, setting)
             if value is None:
                 continue
             if not hasattr(agent.config, setting):
-                raise ConfigError(f"{setting} = {value}, allowed for agents that re-rank; {name} does not")
+                raise ConfigError(f"{setting} = {value}, allowed for {able}; not for {name}")
             agent.config = agent.config.model_copy(update={setting: value})
         if self.solver is not None:
             actor = getattr(agent, "actor", None)
