@@ -70,7 +70,7 @@ class Setting(BaseModel):
     deterministic: bool = Field(True, description="which action is judged; the other one's return is kept as well")
     episodes: int = Field(100, ge=1, description="environments")
     fading_seeds: int = Field(3, ge=1, description="flights in each")
-    points: int = Field(8, ge=1, description="of the learning curve, each flown once in every environment")
+    points: int = Field(8, ge=0, description="of the learning curve, each flown once in every environment; 0: no curve")
     seed: int = Field(EVALUATION_SEED, ge=0, description="of the environments")
 
     def environments(self, fading_seeds: int) -> EvaluationSet:
@@ -94,7 +94,7 @@ def measure(run: Run, directory: Path) -> Scores:
 
     Returns:
         flown: metric -> a number an environment, the mean over its fading repeats; other_return: that of the action
-        not asked for; curve: metric -> numbers over "at"; decision_ms; diverged: why a training stopped early, its last
+        not asked for; curve: metric -> numbers over "at", where asked for; decision_ms; diverged: why a training stopped early, its last
         good checkpoint being judged then.
     """
     setting = Setting.model_validate(run.options)
@@ -124,14 +124,14 @@ def _learn_offline(run: Run, setting: Setting, directory: Path) -> tuple[Policy,
     agent = TypeAdapter[OfflineConfig](OfflineConfig).validate_python(run.settings)
     if setting.data is None:
         raise ValueError("an offline run needs data")
-    every = max(1, run.updates // setting.points)
+    every = max(1, run.updates // setting.points) if setting.points else 0
     plan = TrainConfig(
         scenario=setting.scenario,
         agent=agent,
         updates=run.updates,
         seed=run.seed,
         evaluate_every=every,
-        save_every=min(1_000, every),
+        save_every=min(1_000, every or run.updates),
     )
     transitions = learned_from(setting.data, setting.scenario)
     learner = OfflineLearner.resume(directory, transitions) or OfflineLearner(plan, transitions)
@@ -150,9 +150,10 @@ def _learn_offline(run: Run, setting: Setting, directory: Path) -> tuple[Policy,
         scores["diverged"] = str(error)
         policy = load_policy(directory, setting.scenario)
     rows = [row for row in read_metrics(directory / "metrics.jsonl") if SHOWN[0] in row]
-    scores["curve"] = {"at": [row["step"] for row in rows]} | {
-        name: _short(np.array([row[name] for row in rows])) for name in SHOWN
-    }
+    if rows:
+        scores["curve"] = {"at": [row["step"] for row in rows]} | {
+            name: _short(np.array([row[name] for row in rows])) for name in SHOWN
+        }
     return policy, scores
 
 

@@ -130,6 +130,7 @@ class Plan:
         protocol: Protocol,
         *,
         headline: bool = False,
+        curve: bool = True,
         variant: str | None = None,
         changes: Mapping[str, Any] | None = None,
         data: Mapping[str, Any] | None = None,
@@ -140,6 +141,7 @@ class Plan:
             algorithm: name of `ALGORITHMS`.
             protocol: where.
             headline: with the seeds and updates of the headline comparison, not of a sweep.
+            curve: fly while learning too, which takes a third of a sweep's time; False where nobody draws it.
             variant: what a figure calls it; by default the algorithm.
             changes: of its settings.
             data: fields of `Data` that differ from 30,000 mixed rows of the protocol's log.
@@ -147,7 +149,7 @@ class Plan:
         every = CHEAPER.get(algorithm, {}) | dict(changes or {})
         settings = changed(preset(ALGORITHMS[algorithm], protocol.preset), every).model_dump(mode="json")
         rows = Data(**{"name": protocol.data, "size": self.size, **(data or {})})
-        options = self._setting(protocol, rows, protocol.deterministic(algorithm))
+        options = self._setting(protocol, rows, protocol.deterministic(algorithm), curve)
         updates = self.scale.updates if headline else self.scale.sweep_updates
         if protocol.preset == "paper":
             updates = self.scale.published_updates
@@ -168,7 +170,9 @@ class Plan:
         """Rows of the usual log, the paper's 30,000 where the scale has as many."""
         return min(30_000, max(self.scale.sizes))
 
-    def _setting(self, protocol: Protocol, data: Data | None = None, deterministic: bool = True) -> dict[str, Any]:
+    def _setting(
+        self, protocol: Protocol, data: Data | None = None, deterministic: bool = True, curve: bool = True
+    ) -> dict[str, Any]:
         scenario = protocol.scenario
         if self.scale.max_steps is not None:
             scenario = scenario.replace(max_steps=self.scale.max_steps)
@@ -179,7 +183,7 @@ class Plan:
             deterministic=deterministic,
             episodes=self.scale.episodes,
             fading_seeds=self.scale.fading_seeds,
-            points=self.scale.points,
+            points=self.scale.points if curve else 0,
         ).model_dump(mode="json")
 
     def references(self, protocol: Protocol) -> list[Run]:
@@ -220,7 +224,7 @@ class Plan:
         return self.references(protocol) + every + (own if protocol.preset == "default" else [])
 
     def sizes(self, protocol: Protocol) -> list[Run]:
-        """Rows to learn from."""
+        """Rows to learn from; with as many as usual these are the runs of the other figures, curves and all."""
         return self._over_data(protocol, {f"{size:,}": {"size": size} for size in self.scale.sizes})
 
     def qualities(self, protocol: Protocol) -> list[Run]:
@@ -233,7 +237,9 @@ class Plan:
             run
             for label, data in choices.items()
             for name in ALGORITHMS
-            for run in self.learned(name, protocol, variant=f"{name} @ {label}", data=data)
+            for run in self.learned(
+                name, protocol, variant=f"{name} @ {label}", data=data, curve=data == {"size": self.size}
+            )
         ]
 
     def denoising(self, protocol: Protocol) -> list[Run]:
@@ -244,7 +250,8 @@ class Plan:
         for schedule in ("linear", "vp"):
             for steps in self.scale.denoising_steps:
                 changes = {"diffusion": {"schedule": schedule, "steps": steps}}
-                found += self.learned(OURS, protocol, variant=f"{schedule} @ {steps}", changes=changes)
+                variant = f"{schedule} @ {steps}"
+                found += self.learned(OURS, protocol, variant=variant, changes=changes, curve=False)
         return found
 
     def age_weights(self) -> list[Run]:
@@ -254,14 +261,15 @@ class Plan:
             base = PROTOCOLS["paper-objective"]
             protocol = base._replace(scenario=base.scenario.replace(age_weight=weight))
             for name in ALGORITHMS:
-                found += self.learned(name, protocol, variant=f"{name} @ {weight:g}")
+                compared = weight == base.scenario.objective.age_weight  # the runs of the comparison under this objective
+                found += self.learned(name, protocol, variant=f"{name} @ {weight:g}", curve=compared)
         return found
 
     def priorities(self) -> list[Run]:
         """Devices that matter more than others."""
         base = PROTOCOLS["layouts"]
         protocol = base._replace(scenario=base.scenario.replace(priority=PRIORITIES))
-        learned = [run for name in ALGORITHMS for run in self.learned(name, protocol)]
+        learned = [run for name in ALGORITHMS for run in self.learned(name, protocol, curve=False)]
         return self.references(protocol) + learned
 
     def biased(self) -> list[Run]:

@@ -22,7 +22,7 @@ _UPDATE_S = {
 }
 _OTHER_UPDATE_S = 0.02
 _FLIGHT_S = 2.0  # of an online learner
-_FLOWN_S = 0.006  # a flight of 400 steps of the evaluation, learned policies
+_FLOWN_S = 0.06  # a flight of 400 steps of the evaluation, learned policies
 _PLANNED_S = 0.4  # and the planner's
 
 
