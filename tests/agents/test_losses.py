@@ -274,14 +274,19 @@ def test_the_critics_use_the_huber_limit_of_their_settings(name: str) -> None:
     assert found[1] < 0.1 * found[0]
 
 
+@pytest.mark.parametrize("per", ["step", "second"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_pinned_level_takes_the_batchs_mean_from_the_target_and_nothing_else(kind: Kind) -> None:
-    """The target is r + gamma (min Q' - its mean): the loss is that of rewards lowered by gamma times the mean."""
+def test_a_pinned_level_takes_the_batchs_mean_from_the_target_and_nothing_else(kind: Kind, per: str) -> None:
+    """The target is r + gamma (min Q' - its mean): the loss is that of rewards lowered by gamma times the mean.
+
+    Per second a step loses the mean in proportion to its duration, so that long steps and short ones stay equal.
+    """
     data = batch(kind, ROWS)
     data = replace(data, terminated=torch.zeros(ROWS))
     chain = ChainNoise(noise(5, ROWS, 2 + D), noise(6, 3, ROWS, 2 + D))
     free, pinned = (
-        diffusion_sac(kind, pinned_level=flag, discount=0.9, huber=None, greedy_choice=True) for flag in (False, True)
+        diffusion_sac(kind, pinned_level=flag, discount=0.9, discount_per=per, huber=None, greedy_choice=True)
+        for flag in (False, True)
     )
     for made in (free, pinned):
         disturb(made.target, 1)
@@ -290,9 +295,11 @@ def test_a_pinned_level_takes_the_batchs_mean_from_the_target_and_nothing_else(k
         context = free.actor.average.encode(data.next_observation)
         w = free.actor.sample(free.actor.average, context, chain)[:, :2].clamp(-1, 1)
         level = free.target.all_choices(free.target.encode(data.next_observation), w).amin(dim=0).amax(dim=1).mean()
-    lowered = replace(data, reward=data.reward - 0.9 * level)
+    share = data.duration_s / data.duration_s.mean() if per == "second" else torch.ones(ROWS)
+    lowered = replace(data, reward=data.reward - discounts(data, free.config) * share * level)
     torch.testing.assert_close(loss, free.critic_loss(lowered, chain, None)[0])
-    assert float(metrics["target_q"]) == pytest.approx(float(data.reward.mean()), abs=1e-5)
+    if per == "step":
+        assert float(metrics["target_q"]) == pytest.approx(float(data.reward.mean()), abs=1e-5)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -74,7 +74,6 @@ def test_interrupted_it_goes_on_where_it_was(
     [
         ([], ["--out"]),
         (["--out", "o", "--scenario", "mars"], ["'mars'"]),
-        (["--out", "o", "--scenario", "realistic"], ["limits.max_steps is none"]),
         (["--out", "o", "--episodes", "0"], ["episodes", "0"]),
         (["--out", "o", "--seed", "1000000"], ["seed", "1000000"]),
         (["--out", "o", "--layouts", "moving"], ["moving", "fixed"]),

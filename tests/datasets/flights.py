@@ -27,7 +27,7 @@ def fly(
     """Fly to the oldest device, with noise, in a few environments at once; the last episodes stay unfinished."""
     generator = np.random.default_rng(seed)
     count, devices = environments, scenario.traffic.devices
-    log = ReplayLog(devices, count * steps)
+    log = ReplayLog(devices)
     episode = np.arange(count)
     layouts = random_positions(generator, (count, devices, 2), scenario)
     layouts = layouts if layout is None else np.broadcast_to(layout, layouts.shape)

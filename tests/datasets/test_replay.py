@@ -19,7 +19,7 @@ def batches(log: Transitions) -> list[dict[str, NDArray[Any]]]:
 
 
 def test_a_log_flown_in_step_comes_out_sorted_by_episode(log: Transitions) -> None:
-    replay = ReplayLog(3, 200)
+    replay = ReplayLog(3)
     for batch in batches(log):
         replay.append(batch)
     assert len(replay) == 120
@@ -28,7 +28,7 @@ def test_a_log_flown_in_step_comes_out_sorted_by_episode(log: Transitions) -> No
 
 
 def test_what_was_flown_is_not_changed_by_what_follows(log: Transitions) -> None:
-    replay = ReplayLog(3, 120)
+    replay = ReplayLog(3)
     first, second = batches(log)[:2]
     replay.append(first)
     early, state = replay.to_transitions().digest(), replay.state_dict()
@@ -40,7 +40,7 @@ def test_what_was_flown_is_not_changed_by_what_follows(log: Transitions) -> None
 
 
 def test_only_the_rows_to_keep_are_added(log: Transitions) -> None:
-    replay = ReplayLog(3, 120)
+    replay = ReplayLog(3)
     replay.append(log.columns(), keep=log.truncated)
     assert len(replay) == 9
     assert replay.take(np.arange(9)).truncated.all()
@@ -48,11 +48,11 @@ def test_only_the_rows_to_keep_are_added(log: Transitions) -> None:
 
 def test_a_log_goes_on_from_a_checkpoint(log: Transitions, tmp_path: Path) -> None:
     flown = batches(log)
-    replay = ReplayLog(3, 120)
+    replay = ReplayLog(3)
     for batch in flown[:17]:
         replay.append(batch)
     save_file(replay.state_dict(), tmp_path / "log.safetensors")
-    resumed = ReplayLog(3, 120)
+    resumed = ReplayLog(3)
     resumed.append(flown[30])  # replaced by what is loaded
     resumed.load_state_dict(load_file(tmp_path / "log.safetensors"))
     for batch in flown[17:]:
@@ -60,13 +60,20 @@ def test_a_log_goes_on_from_a_checkpoint(log: Transitions, tmp_path: Path) -> No
     assert resumed.to_transitions().digest() == log.digest()
 
 
-def test_a_full_or_foreign_log_refuses_and_keeps_what_it_has(log: Transitions) -> None:
-    replay = ReplayLog(3, 121)
-    replay.append(log.columns())
-    with pytest.raises(DatasetError, match="log is full: 240 rows, allowed: 121"):
+def test_a_log_grows_and_keeps_its_rows(log: Transitions) -> None:
+    replay = ReplayLog(3)
+    for _ in range(80):  # 9,600 rows, more than twice what there is room for at first
         replay.append(log.columns())
+    assert len(replay) == 80 * len(log)
+    for start in (0, 34 * len(log), 79 * len(log)):
+        assert replay.take(start + np.arange(len(log))).digest() == log.digest()
+
+
+def test_a_log_refuses_foreign_rows_and_keeps_what_it_has(log: Transitions) -> None:
+    replay = ReplayLog(3)
+    replay.append(log.columns())
     with pytest.raises(DatasetError, match=r"'layout_m' has shape \(120, 3, 2\), allowed: \(120, 2, 2\)"):
-        ReplayLog(2, 121).append(log.take(slice(None)).columns())
+        ReplayLog(2).append(log.take(slice(None)).columns())
     with pytest.raises(DatasetError, match="'age_term'"):
         replay.load_state_dict({name: v for name, v in log.columns().items() if name != "age_term"})
     cut = {**log.take(slice(60, 120)).columns(), "next_used_j": np.zeros(59)}

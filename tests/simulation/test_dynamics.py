@@ -16,7 +16,7 @@ from tests.simulation.reference import SCENARIOS
 from tests.simulation.reference import step as reference_step
 from uavrl.physics.energy import hover_power_w
 from uavrl.scenario import Scenario, load_scenario
-from uavrl.simulation.dynamics import advance, initial_state
+from uavrl.simulation.dynamics import advance, initial_state, may_terminate
 from uavrl.simulation.state import Draws, FlightAction, Outcome, SimState
 
 Float = NDArray[np.float64]
@@ -485,3 +485,22 @@ class TestReferenceFigures:
 
     def test_nearest_device_on_released(self) -> None:
         assert returns(load_scenario("released"), nearest).mean() == pytest.approx(-5465.0, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, False),  # 400 s and a last step of at most 3.1 s at the 249 W of 25 m/s are less than 150 kJ
+        ({"energy_budget_j": None}, False),
+        ({"energy_budget_j": 90e3}, True),
+        ({"time_budget_s": 800.0}, True),
+        ({"time_budget_s": 800.0, "max_steps": 100}, False),
+        ({"time_budget_s": None, "max_steps": 100}, False),
+        ({"max_transmission_s": None}, True),
+        ({"decision_time": "measured"}, True),
+    ],
+)
+def test_a_flight_may_end_by_itself_where_full_power_can_drain_the_battery(
+    changes: dict[str, Any], expected: bool
+) -> None:
+    assert may_terminate(load_scenario("realistic", **changes)) == expected

@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from tests.datasets.flights import fly, small_scenario
-from uavrl.agents.base import Batch, RewardConfig
+from uavrl.agents.base import AgentConfig, Batch, RewardConfig
 from uavrl.datasets import save_mapped
 from uavrl.scenario import load_scenario
 from uavrl.simulation.environment import observe
 from uavrl.simulation.observations import ObservationKind
 from uavrl.simulation.state import SimState
-from uavrl.training.batches import MappedRows, reward_transform, spaces_of, to_batch, transformed
+from uavrl.training.batches import MappedRows, RewardTransform, spaces_of, to_batch
 
 
 @pytest.mark.parametrize("kind", ["paper", "devices"])
@@ -85,6 +85,7 @@ def test_spaces_are_those_of_the_scenario() -> None:
 
 
 REWARD = np.array([-10.0, -1.0, -2.0, -3.0, -4.0])
+DURATION_S = np.array([0.5, 1.0, 2.0, 0.5, 0.25])
 
 
 @pytest.mark.parametrize(
@@ -99,12 +100,24 @@ REWARD = np.array([-10.0, -1.0, -2.0, -3.0, -4.0])
     ],
 )
 def test_rewards_are_transformed_as_the_setting_says(config: RewardConfig, terminates: bool, expected: Any) -> None:
-    shift, factor = reward_transform(REWARD, config, terminates)
-    found = transformed(torch.from_numpy(REWARD), shift, factor, config)
+    seen = RewardTransform.fitted(REWARD, DURATION_S, AgentConfig(reward=config), terminates)
+    found = seen(torch.from_numpy(REWARD), torch.from_numpy(DURATION_S))
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-5)
+
+
+def test_a_level_per_second_is_the_same_for_any_cut_of_the_time_into_steps() -> None:
+    config = AgentConfig(discount_per="second", reward=RewardConfig(transform="centred", clip=None, scale=2.0))
+    seen = RewardTransform.fitted(REWARD, DURATION_S, config, False)  # rates -20, -1, -1, -6, -16
+    assert seen.level == -6.0
+    found = seen(torch.from_numpy(REWARD), torch.from_numpy(DURATION_S))
+    np.testing.assert_allclose(found.numpy(), 2.0 * (REWARD + 6.0 * DURATION_S))
+    whole = seen(torch.tensor([-4.0]), torch.tensor([3.0]))
+    halves = seen(torch.tensor([-1.0, -3.0]), torch.tensor([2.0, 1.0]))
+    assert halves.sum() == pytest.approx(float(whole))
+    assert RewardTransform.fitted(REWARD, DURATION_S, config, True).level == 0.0
 
 
 def test_equal_rewards_do_not_divide_by_zero() -> None:
     config = RewardConfig(transform="zscore", clip=None)
-    shift, factor = reward_transform(np.full(5, -2.0), config, False)
-    assert transformed(torch.full((5,), -2.0), shift, factor, config).abs().max() < 1e-3
+    seen = RewardTransform.fitted(np.full(5, -2.0), DURATION_S, AgentConfig(reward=config), False)
+    assert seen(torch.full((5,), -2.0), torch.from_numpy(DURATION_S)).abs().max() < 1e-3

@@ -390,16 +390,16 @@ def test_statistics_of_mapped_data_are_of_a_sample_and_extremes_and_minibatches_
     flown: Transitions, mapped: MappedTransitions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("uavrl.training.offline.SAMPLE_ROWS", 20)
-    plain = {"reward": {"transform": "zscore", "clip": None}, "discount_per": "second"}
+    plain = {"reward": {"transform": "zscore", "clip": None}}
     learner = OfflineLearner(config(kind="mlp", agent=plain), mapped)
     known = mapped.sample(20)
     assert len(learner.sample) == 20
-    assert learner.shift == pytest.approx(float(known.reward.mean()))
+    assert learner.seen.level == pytest.approx(float(known.reward.mean()))
     assert learner.expected.reward_deviation == pytest.approx(1.0, rel=1e-3)
     means = [value for name, value in learner.agent.networks.state_dict().items() if name.endswith("normaliser.mean")]
     np.testing.assert_allclose(means[0][:2].numpy(), known.position_m.mean(axis=0), rtol=1e-3)
     assert known.reward.min() > flown.reward.min()
-    lowest = (float(flown.reward.min()) - learner.shift) / float(known.reward.std())
+    lowest = (float(flown.reward.min()) - learner.seen.level) / float(known.reward.std())
     assert learner.rewards[0] == pytest.approx(lowest, rel=1e-3)
     assert learner.shortest_s == float(flown.duration_s.min())
     assert len(learner.data) == 60

@@ -151,7 +151,7 @@ def test_recentring_moves_the_level_of_q_and_no_difference() -> None:
 
     before = values()
     learner._recentre()
-    assert learner.centre == pytest.approx(float(np.median(learner.log.take(np.arange(len(learner.log))).reward)))
+    assert learner.seen.level == pytest.approx(float(np.median(learner.log.take(np.arange(len(learner.log))).reward)))
     moved = values() - before
     torch.testing.assert_close(moved, moved.flatten()[0].expand_as(moved), rtol=1e-4, atol=1e-4)
     assert values()[0].abs().max() < 10.0
@@ -169,7 +169,7 @@ def test_rewards_are_centred_where_asked_and_where_no_flight_ends_by_itself(
     )
     learner = OnlineLearner(settings)
     learner.run(tmp_path, quiet)
-    assert (learner.centre != 0.0) == centred
+    assert (learner.seen.level != 0.0) == centred
 
 
 def test_a_transform_that_needs_all_data_is_refused() -> None:
@@ -216,7 +216,10 @@ def test_resume_refuses_what_it_cannot_go_on_with(tmp_path: Path) -> None:
         assert "\n" not in str(error.value)
 
 
-def test_a_scenario_without_a_step_limit_is_refused() -> None:
-    endless = SCENARIO.replace(max_steps=None)
-    with pytest.raises(ConfigError, match=r"limits.max_steps is none"):
-        OnlineLearner(config().model_copy(update={"scenario": endless}))
+def test_flights_that_end_by_time_alone_are_logged_whole(tmp_path: Path) -> None:
+    timed = SCENARIO.replace(max_steps=None, time_budget_s=3.0)
+    log = OnlineLearner(config().model_copy(update={"scenario": timed})).run(tmp_path, quiet)
+    assert set(log.episode.tolist()) == set(range(config().episodes))
+    for episode in range(config().episodes):
+        duration_s = log.duration_s[log.episode == episode]
+        assert duration_s[:-1].sum() <= 3.0 < duration_s.sum()

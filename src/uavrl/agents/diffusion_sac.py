@@ -76,8 +76,9 @@ class DiffusionSacConfig(AgentConfig):
     )
     pinned_level: bool = Field(
         False,
-        description="subtract the batch's mean from Q' in the backup (as relative value iteration does): differences "
-        "need not wait for a level that is 1 / (1 - gamma) rewards away. Not for data that can terminate",
+        description="subtract the batch's mean from Q' in the backup (as relative value iteration does; in proportion "
+        "to a step's duration where discount_per is second): differences need not wait for a level that is "
+        "1 / (1 - gamma) rewards away. Not for data that can terminate",
     )
     bc_weight: float = Field(0.02, ge=0, le=1, description="eta of eq. (actor_loss_all)")
     cql_weight: float = Field(0.0, ge=0, description="alpha of eq. (crtici_CQL); 0 skips the penalty")
@@ -172,7 +173,9 @@ class DiffusionSac(Agent):
             following = following._replace(continuous=self._jittered(following.continuous, jitter))
             q_next = self._best(self.target, self.target.encode(batch.next_observation), following)[0]
             if self.config.pinned_level:
-                q_next = q_next - q_next.mean()
+                per_second = self.config.discount_per == "second"  # a level is lost in proportion to time then
+                share = batch.duration_s / batch.duration_s.mean() if per_second else 1.0
+                q_next = q_next - q_next.mean() * share
             target = batch.reward + discounts(batch, self.config) * q_next
         context, penalty = self.critic.encode(batch.observation), None
         if self.config.cql_weight > 0 and self.config.cql_samples == 0:

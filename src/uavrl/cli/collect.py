@@ -44,15 +44,17 @@ class Collect:
         from uavrl.datasets import save_flat, write_minari
         from uavrl.networks import NetworkConfig
         from uavrl.training.log import progress, require_tensorboard
+        from uavrl.training.objective import for_objective
         from uavrl.training.online import CollectConfig, OnlineLearner, same_run
 
         if self.tensorboard:
             require_tensorboard()
         width = 256 if self.network == "mlp" else 64
-        agent = SacConfig(network=NetworkConfig(kind=self.network, width=width))
+        scenario = load_scenario(self.scenario)
+        agent = for_objective(SacConfig(network=NetworkConfig(kind=self.network, width=width)), scenario)
         config = pydantic_config(
             CollectConfig,
-            scenario=load_scenario(self.scenario),
+            scenario=scenario,
             layouts=self.layouts,
             agent=with_settings(agent, self.set),
             episodes=self.episodes,
@@ -66,9 +68,8 @@ class Collect:
             raise ConfigError(f"--out '{self.out}' holds a run of other settings; give another directory")
         else:
             print(f"going on from step {len(learner.log):,}", file=sys.stderr)
-        limit = config.scenario.limits.max_steps or 0
         try:
-            with progress("collect", config.episodes * limit, "step") as report:
+            with progress("collect", config.episodes, "flight") as report:
                 transitions = learner.run(self.out, report, tensorboard=self.tensorboard)
         except KeyboardInterrupt:
             if learner.saved is not None:

@@ -70,6 +70,7 @@ class Train:
         from uavrl.training.checkpoint import recover
         from uavrl.training.health import summary
         from uavrl.training.log import progress, read_metrics, require_tensorboard
+        from uavrl.training.objective import for_objective
         from uavrl.training.offline import PRESET_UPDATES, OfflineLearner, TrainConfig
 
         if self.tensorboard:
@@ -81,10 +82,11 @@ class Train:
         elif self.quality != "mixed":
             raise ConfigError(f"--quality {self.quality} needs --size")
         updates = PRESET_UPDATES[self.preset] if self.updates is None else self.updates
+        agent = preset(self.agent, self.preset)
         config = pydantic_config(
             TrainConfig,
             scenario=scenario,
-            agent=with_settings(preset(self.agent, self.preset), self.set),
+            agent=with_settings(agent if self.preset == "paper" else for_objective(agent, scenario), self.set),
             updates=updates,
             seed=self.seed,
             log_every=min(LOG_EVERY, max(1, updates // 50)),  # enough rows to judge a short run by

@@ -94,8 +94,8 @@ def measure(run: Run, directory: Path) -> Scores:
 
     Returns:
         flown: metric -> a number an environment, the mean over its fading repeats; other_return: that of the action
-        not asked for; curve: metric -> numbers over "at", where asked for; decision_ms; diverged: why a training stopped early, its last
-        good checkpoint being judged then.
+        not asked for; curve: metric -> numbers over "at", where asked for; decision_ms; diverged: why a training
+        stopped early, its last good checkpoint being judged then.
     """
     setting = Setting.model_validate(run.options)
     scores: Scores = {}

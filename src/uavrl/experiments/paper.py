@@ -15,6 +15,7 @@ from uavrl.agents.sac import SacConfig
 from uavrl.experiments.flights import Data, Setting
 from uavrl.experiments.runner import Run
 from uavrl.scenario import Scenario, load_scenario
+from uavrl.training.objective import for_objective
 
 OURS = "Diffusion-SAC"
 ALGORITHMS = {OURS: "diffusion_sac", "CQL": "cql", "IQL": "iql", "BCQ": "bcq", "BC": "bc"}
@@ -147,7 +148,10 @@ class Plan:
             data: fields of `Data` that differ from 30,000 mixed rows of the protocol's log.
         """
         every = CHEAPER.get(algorithm, {}) | dict(changes or {})
-        settings = changed(preset(ALGORITHMS[algorithm], protocol.preset), every).model_dump(mode="json")
+        agent = changed(preset(ALGORITHMS[algorithm], protocol.preset), every)
+        if protocol.preset == "default":
+            agent = for_objective(agent, protocol.scenario)
+        settings = agent.model_dump(mode="json")
         rows = Data(**{"name": protocol.data, "size": self.size, **(data or {})})
         options = self._setting(protocol, rows, protocol.deterministic(algorithm), curve)
         updates = self.scale.updates if headline else self.scale.sweep_updates
@@ -261,7 +265,7 @@ class Plan:
             base = PROTOCOLS["paper-objective"]
             protocol = base._replace(scenario=base.scenario.replace(age_weight=weight))
             for name in ALGORITHMS:
-                compared = weight == base.scenario.objective.age_weight  # the runs of the comparison under this objective
+                compared = weight == base.scenario.objective.age_weight  # those are the comparison's runs
                 found += self.learned(name, protocol, variant=f"{name} @ {weight:g}", curve=compared)
         return found
 

@@ -22,6 +22,21 @@ def initial_state(position_m: Array, devices: int) -> SimState:
     return SimState(position_m=position_m, age_s=ages, energy_j=zero, used_j=zero, time_s=zero, step=steps)
 
 
+def may_terminate(scenario: Scenario) -> bool:
+    """Whether the battery can be empty before the time is up, at full power throughout and through the last step."""
+    frame, limits = scenario.airframe, scenario.limits
+    limit_s = scenario.channel.max_transmission_s
+    if limits.energy_budget_j is None:
+        return False
+    if limit_s is None or frame.decision_time == "measured":
+        return True  # a step may take for ever
+    step_s = frame.max_displacement_m / frame.speed_mps + limit_s + max(frame.decision_s, frame.min_idle_s)
+    times = [] if limits.time_budget_s is None else [limits.time_budget_s + step_s]
+    times += [] if limits.max_steps is None else [limits.max_steps * step_s]
+    power_w = max(energy.hover_power_w(frame) + frame.communication_power_w, energy.flight_power_w(frame))
+    return min(times) * power_w > limits.energy_budget_j
+
+
 def _fly(x: Array, y: Array, displacement_m: Array, d_max: float, area: Area) -> tuple[Array, Array]:
     """Coordinates after a move of at most d_max under the scenario's border rule (m)."""
     xp = array_namespace(x)

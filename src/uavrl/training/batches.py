@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from uavrl.actions import HybridAction
-from uavrl.agents.base import Batch, RewardConfig
+from uavrl.agents.base import AgentConfig, Batch
 from uavrl.datasets.mapped import MappedTransitions
 from uavrl.datasets.transitions import Transitions
 from uavrl.networks import Observation, Spaces
@@ -78,20 +78,37 @@ class MappedRows:
         return self.encode(self.transitions.take(ascending.numpy())).take(places).to(rows.device)
 
 
-def reward_transform(reward: NDArray[Any], config: RewardConfig, terminates: bool) -> tuple[float, float]:
-    """(shift, factor) so that the agent sees clip(factor (r - shift)).
+class RewardTransform(NamedTuple):
+    """From logged rewards to what an agent learns from: clip(factor (r - level T)).
 
-    "centred" subtracts the median; where an episode can terminate, a shift would pay or punish ending it, so it is 0.
+    T is 1 where the agent discounts by steps, and a step's duration (s) where it discounts by seconds: only then does
+    the level, which each flight of a fixed time loses as often, prefer neither short steps nor long ones.
     """
-    values = np.asarray(reward, dtype=np.float64)
-    if config.transform == "zscore":
-        return float(values.mean()), config.scale / (float(values.std()) + 1e-6)
-    if config.transform == "centred":
-        return (0.0 if terminates else float(np.median(values))), config.scale
-    return 0.0, config.scale
 
+    level: float  # a step, or a second
+    factor: float
+    clip: float | None
+    per_second: bool
 
-def transformed(reward: torch.Tensor, shift: float, factor: float, config: RewardConfig) -> torch.Tensor:
-    """clip(factor (r - shift))."""
-    moved = factor * (reward - shift)
-    return moved if config.clip is None else moved.clamp(-config.clip, config.clip)
+    @classmethod
+    def fitted(
+        cls, reward: NDArray[Any], duration_s: NDArray[Any], config: AgentConfig, terminates: bool
+    ) -> RewardTransform:
+        """For rewards and durations (n,) of logged steps.
+
+        "centred" subtracts the median; where an episode can terminate, a level would pay or punish ending it, so it is
+        0.
+        """
+        how, per_second = config.reward, config.discount_per == "second"
+        values = np.asarray(reward, dtype=np.float64)
+        levels = values / duration_s if per_second else values
+        if how.transform == "zscore":
+            factor = how.scale / (float(values.std()) + 1e-6)
+            return cls(float(levels.mean()), factor, how.clip, per_second)
+        centred = how.transform == "centred" and not terminates
+        return cls(float(np.median(levels)) if centred else 0.0, how.scale, how.clip, per_second)
+
+    def __call__(self, reward: torch.Tensor, duration_s: torch.Tensor) -> torch.Tensor:
+        """What the agent sees of rewards and durations (n,)."""
+        moved = self.factor * (reward - self.level * (duration_s if self.per_second else 1.0))
+        return moved if self.clip is None else moved.clamp(-self.clip, self.clip)

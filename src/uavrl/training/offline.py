@@ -24,7 +24,8 @@ from uavrl.errors import CheckpointError, ConfigError, DivergenceError
 from uavrl.evaluation.rollouts import EVALUATION_SEED
 from uavrl.networks import fit_normalisers
 from uavrl.scenario import Scenario
-from uavrl.training.batches import OBSERVATION_OF, MappedRows, reward_transform, spaces_of, to_batch, transformed
+from uavrl.simulation.dynamics import may_terminate
+from uavrl.training.batches import OBSERVATION_OF, MappedRows, RewardTransform, spaces_of, to_batch
 from uavrl.training.checkpoint import agent_tensors, load_checkpoint, recover, restore_agent, save_checkpoint
 from uavrl.training.compilation import Compilation, compile_passes
 from uavrl.training.fit import Rows, learn_once
@@ -83,18 +84,14 @@ class OfflineLearner:
         self.config, self.device = config, torch.device(device)
         kind = OBSERVATION_OF[config.agent.network.kind]
         least, most = transitions.reward.min(), transitions.reward.max()  # first: mapped files are read in order
-        self.shortest_s = float(transitions.duration_s.min())
+        self.shortest_s, longest_s = float(transitions.duration_s.min()), float(transitions.duration_s.max())
         known = transitions.sample(SAMPLE_ROWS) if isinstance(transitions, MappedTransitions) else transitions
-        terminates = config.scenario.limits.energy_budget_j is not None
-        reward = config.agent.reward
-        self.shift, factor = reward_transform(known.reward, reward, terminates)
-
-        def seen(raw: torch.Tensor) -> torch.Tensor:
-            return transformed(raw, self.shift, factor, reward)
+        terminates = may_terminate(config.scenario)
+        self.seen = RewardTransform.fitted(known.reward, known.duration_s, config.agent, terminates)
 
         def encode(rows: Transitions) -> Batch:
             batch = to_batch(rows, kind, config.scenario)
-            return replace(batch, reward=seen(batch.reward))
+            return replace(batch, reward=self.seen(batch.reward, batch.duration_s))
 
         sample = encode(known)
         agent = config.agent
@@ -110,8 +107,9 @@ class OfflineLearner:
         self.data: Rows = self.sample
         if isinstance(transitions, MappedTransitions):
             self.data = MappedRows(transitions, encode)
-        extremes = seen(torch.tensor([least, most]))
-        self.rewards = (float(extremes[0]), float(extremes[1]))  # the least and the most that the agent is given
+        extremes = torch.tensor([least, least, most, most]), torch.tensor([self.shortest_s, longest_s] * 2)
+        extreme = self.seen(*extremes)
+        self.rewards = (float(extreme.min()), float(extreme.max()))  # no less and no more is the agent given
         self.generator = torch.Generator(self.device).manual_seed(config.seed)
         self.digest = transitions.digest()
         self.updates = 0

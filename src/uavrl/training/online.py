@@ -20,9 +20,10 @@ from uavrl.errors import CheckpointError, ConfigError, DivergenceError
 from uavrl.evaluation.rollouts import EVALUATION_SEED, fixed_layout
 from uavrl.networks import fit_normalisers
 from uavrl.scenario import Scenario
+from uavrl.simulation.dynamics import may_terminate
 from uavrl.simulation.environment import ENVIRONMENT_ID, DataCollectionVectorEnv
 from uavrl.simulation.state import FlightAction, Outcome, SimState
-from uavrl.training.batches import OBSERVATION_OF, spaces_of, to_batch, to_tensors, transformed
+from uavrl.training.batches import OBSERVATION_OF, RewardTransform, spaces_of, to_batch, to_tensors
 from uavrl.training.checkpoint import (
     agent_tensors,
     load_checkpoint,
@@ -63,8 +64,6 @@ class OnlineLearner:
     def __init__(self, config: CollectConfig) -> None:
         self.config = config
         scenario = config.scenario
-        if scenario.limits.max_steps is None:
-            raise ConfigError("limits.max_steps is none, collecting needs a number of steps to size its log")
         if config.agent.reward.transform == "zscore":
             raise ConfigError("reward.transform = 'zscore' needs all data, allowed while collecting: 'centred', 'none'")
         self.kind = OBSERVATION_OF[config.agent.network.kind]
@@ -84,7 +83,7 @@ class OnlineLearner:
             self.agent = Sac(spaces_of(scenario, config.agent.network.kind), config.agent)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.numbers = np.random.default_rng([config.seed, 1])
-        self.log = ReplayLog(scenario.traffic.devices, config.episodes * scenario.limits.max_steps)
+        self.log = ReplayLog(scenario.traffic.devices)
         self.observation, _ = self.environment.reset(seed=config.seed)
         self.episode = np.arange(config.environments)
         self.returns = np.zeros(config.environments)
@@ -92,7 +91,9 @@ class OnlineLearner:
         self.finished = 0
         self.updates = 0
         self.saved: int | None = None  # the step of the last checkpoint
-        self.centre = 0.0
+        reward = config.agent.reward
+        self.seen = RewardTransform(0.0, reward.scale, reward.clip, config.agent.discount_per == "second")
+        self.centres = reward.transform == "centred" and not may_terminate(scenario)
 
     def _act(self) -> FlightAction:
         reach = self.config.scenario.airframe.max_displacement_m
@@ -129,7 +130,7 @@ class OnlineLearner:
     def _recentre(self) -> None:
         """Zero of the reward: the median of the newest rewards; zero of Q: its mean over the newest states."""
         newest = self.log.take(np.arange(max(0, len(self.log) - 5_000), len(self.log)))
-        self.centre = float(np.median(newest.reward))
+        self.seen = RewardTransform.fitted(newest.reward, newest.duration_s, self.config.agent, terminates=False)
         batch = to_batch(newest.take(slice(-1_000, None)), self.kind, self.config.scenario)
         with torch.no_grad():
             critic = self.agent.critic
@@ -142,13 +143,11 @@ class OnlineLearner:
         if self.updates == 0:
             first = self.log.take(np.arange(len(self.log)))
             fit_normalisers(self.agent.networks, to_tensors(first.observations(self.kind, self.config.scenario)[0]))
-        centred = self.config.agent.reward.transform == "centred" and not self.config.scenario.limits.energy_budget_j
-        if centred and self.updates % self.config.centre_every == 0:
+        if self.centres and self.updates % self.config.centre_every == 0:
             self._recentre()
         rows = self.numbers.integers(0, len(self.log), self.config.agent.batch_size)
         batch = to_batch(self.log.take(rows), self.kind, self.config.scenario)
-        reward = self.config.agent.reward
-        batch = replace(batch, reward=transformed(batch.reward, self.centre, reward.scale, reward))
+        batch = replace(batch, reward=self.seen(batch.reward, batch.duration_s))
         self.updates += 1
         metrics = self.agent.update(batch, self.generator)
         for name in ("critic_loss", "actor_loss"):  # each time: the next action of a policy of NaN cannot be drawn
@@ -184,9 +183,9 @@ class OnlineLearner:
                         metrics = self._learn()
                         if self.updates % 1000 == 0:
                             row = {name: float(value) for name, value in metrics.items()}
-                            log.write({"step": len(self.log), "updates": self.updates, "centre": self.centre} | row)
+                            log.write({"step": len(self.log), "updates": self.updates, "centre": self.seen.level} | row)
                 mean = f", return {np.mean(recent):.0f} (last {len(recent)})" if recent else ""
-                report(len(self.log), f"episode {self.finished}{mean}")
+                report(self.finished, f"step {len(self.log):,}{mean}")
                 stop = interrupted()
                 if stop or len(self.log) - (self.saved or 0) >= save_every:
                     self.save(directory)
@@ -207,7 +206,7 @@ class OnlineLearner:
             "step": len(self.log),
             "finished": self.finished,
             "updates": self.updates,
-            "centre": self.centre,
+            "centre": self.seen.level,
             "numbers": numpy_state(self.numbers),
             "environment": numpy_state(self.environment.np_random),
         }
@@ -257,7 +256,8 @@ class OnlineLearner:
         learner.generator.set_state(tensors["loop"]["generator"])
         learner.episode, learner.returns, learner.ended = loop["episode"], loop["returns"], loop["ended"]
         learner.finished, learner.updates = document["finished"], document["updates"]
-        learner.centre, learner.saved = document["centre"], len(learner.log)
+        learner.seen = learner.seen._replace(level=document["centre"])
+        learner.saved = len(learner.log)
         learner.observation = learner.environment.observation()
         return learner
 
