@@ -149,7 +149,9 @@ def _chosen(points: Sequence[Point], **wanted: Any) -> list[Point]:
     return [point for point in points if all(point[key] == value for key, value in wanted.items())]
 
 
-def _references(axes: Axes, points: Sequence[Point], metric: str, low: float, high: float) -> list[str]:
+def _references(
+    axes: Axes, points: Sequence[Point], metric: str, low: float, high: float, *, left: bool = False
+) -> list[str]:
     """Dashed lines of what needs no learning, named at an end; those outside [low, high] are returned as text."""
     outside: list[str] = []
     close: list[list[Point]] = []  # lines, from above, whose names would cover each other
@@ -165,7 +167,7 @@ def _references(axes: Axes, points: Sequence[Point], metric: str, low: float, hi
     for group in close:
         names = ", ".join(point["name"] for point in group)
         place: Any = {"xycoords": axes.get_yaxis_transform(), "fontsize": 6, "color": "#555555", "va": "bottom"}
-        axes.annotate(names, (0.995, group[0]["mean"]), ha="right", **place)
+        axes.annotate(names, (0.005 if left else 0.995, group[0]["mean"]), ha="left" if left else "right", **place)
     return outside
 
 
@@ -182,6 +184,9 @@ def _outside(axes: Axes, names: Sequence[str]) -> None:
         axes.text(0.02, 0.02, "not shown: " + ", ".join(names), transform=axes.transAxes, fontsize=5.5, color="#777777")
 
 
+_LAST = "its last policy, deterministic"
+
+
 def _curves(figure: Figure, points: Sequence[Point]) -> Canvas:
     canvas, every = _panels(len(SHOWN))
     names = _learned(points)
@@ -196,13 +201,19 @@ def _curves(figure: Figure, points: Sequence[Point]) -> Canvas:
             line = [p for p in late if p["name"] == name]
             x = [p["at"] for p in line]
             colour, marker = look[name]
-            axes.plot(x, [p["mean"] for p in line], color=colour, marker=marker, label=name, zorder=3)
+            label = name
+            if name == ONLINE:  # it explores while it learns: what it ends at is judged apart
+                label += ", while learning"
+            axes.plot(x, [p["mean"] for p in line], color=colour, marker=marker, label=label, zorder=3)
+            if name == ONLINE:
+                (end,) = (p for p in ends if p["name"] == name)
+                axes.plot(x[-1], end["mean"], color="black", marker="*", ms=8, ls="none", label=_LAST, zorder=4)
             axes.fill_between(x, [p["low"] for p in line], [p["high"] for p in line], color=colour, alpha=0.15, lw=0)
-        _outside(axes, _references(axes, points, metric, low, high))
+        _outside(axes, _references(axes, points, metric, low, high, left=names == [ONLINE]))
         axes.set_ylim(low, high)
         axes.set_title(LABELS[metric])
         axes.set_xlabel("flights" if names == [ONLINE] else "updates")
-    _legend(canvas, every[0], len(names))
+    _legend(canvas, every[0], len(names) + (ONLINE in names))
     return canvas
 
 
