@@ -64,16 +64,17 @@ demo: $(STAMP)  ## learn a small policy from logged flights and watch it
 	$(BIN)/python -m uavrl demo $(DEMO_FLAGS)
 
 # The data that the package ships, remade: hours. `good` and `bad` are the last and first third of each training.
-data: $(STAMP)  ## collect the built-in data anew, with its good and bad parts, into runs/ (about an hour)
-	for name in fixed layouts; do \
+data: $(STAMP)  ## collect the built-in data anew, with its good and bad parts, into runs/ (an hour and a half)
+	for name in fixed layouts realistic; do \
 	  kind=$$([ $$name = fixed ] && echo fixed || echo random); \
-	  $(BIN)/uavrl collect --out runs/$$name --layouts $$kind --minari uavrl/$$name-v0 && \
+	  how=$$([ $$name = realistic ] && echo "--scenario realistic --episodes 150 --set discount=0.97 --set reward.scale=6"); \
+	  $(BIN)/uavrl collect --out runs/$$name --layouts $$kind $$how --minari uavrl/$$name-v0 && \
 	  for quality in mixed good bad; do \
 	    size=$$([ $$quality = mixed ] && echo 50000 || echo 30000); \
 	    $(BIN)/uavrl data select runs/$$name/flights.parquet --size $$size --quality $$quality --out runs/$$name-$$quality.parquet || exit 1; \
 	  done || exit 1; \
 	done
-	@echo "to ship them: cp runs/fixed-mixed.parquet src/uavrl/datasets/builtin/fixed.parquet, and layouts likewise"
+	@echo "to ship them: cp runs/fixed-mixed.parquet src/uavrl/datasets/builtin/fixed.parquet, and the others likewise"
 
 # d3rlpy pins an older gymnasium, so it has an environment of its own; arrays on disk are all that passes between them.
 PEERS := .venv-peers

@@ -17,7 +17,7 @@ from uavrl.datasets import (
     write_minari,
 )
 from uavrl.errors import DatasetError, ScenarioError
-from uavrl.scenario import Scenario
+from uavrl.scenario import Scenario, load_scenario
 
 
 def test_a_source_is_a_file_or_a_minari_dataset(
@@ -82,11 +82,11 @@ def test_installed_data_is_what_the_documentation_says(name: str) -> None:
         transitions, scenario = load_source(name)
     except DatasetError as error:
         pytest.skip(str(error))
-    assert (len(transitions), scenario.name) == (50_000, "released")
+    assert (len(transitions), scenario) == (50_000, load_scenario("realistic" if name == "realistic" else "released"))
     layouts = np.unique(transitions.layout_m.reshape(len(transitions), -1), axis=0)
     if name == "fixed":
         fixed = np.random.default_rng(0).uniform(0, 1000, (10, 2))
         np.testing.assert_allclose(layouts, fixed.reshape(1, -1), rtol=1e-6)
     else:
-        assert len(layouts) > 300
+        assert len(layouts) == (150 if name == "realistic" else 700)
     assert len(load_builtin(name)) == 30_000

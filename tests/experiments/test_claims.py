@@ -61,7 +61,7 @@ def test_a_world_as_the_paper_has_it(figures: dict[str, list[dict[str, Any]]]) -
 
 
 def test_a_verdict_turns_with_what_was_measured(figures: dict[str, list[dict[str, Any]]]) -> None:
-    comparisons = ("comparison", "comparison-published", "comparison-paper")
+    comparisons = ("comparison", "comparison-published", "comparison-paper", "comparison-realistic")
     worse = changed(figures, comparisons, {"CQL": 190.0})
     assert verdict(worse, "Diffusion-SAC achieves the highest return") == FAILS
     one_protocol = changed(figures, comparisons[:1], {"CQL": 190.0})

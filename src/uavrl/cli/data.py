@@ -28,7 +28,7 @@ class DataShow:
     """Report what logged flights hold: behaviour, coverage, choices."""
 
     source: Source
-    """fixed or layouts, a .parquet or .npz file, a .mapped directory, or the id of a Minari dataset"""
+    """fixed, layouts or realistic, a .parquet or .npz file, a .mapped directory, or the id of a Minari dataset"""
     scenario: str | None = None
     """preset or .toml file that it was flown in; none: the one it carries"""
     json: Path | None = None
@@ -53,7 +53,7 @@ class DataSelect:
     """Write a seeded part of a training's log to a flat file."""
 
     source: Source
-    """fixed or layouts, a .parquet or .npz file, a .mapped directory, or the id of a Minari dataset"""
+    """fixed, layouts or realistic, a .parquet or .npz file, a .mapped directory, or the id of a Minari dataset"""
     out: Path
     """.parquet or .npz file, or .mapped directory, to write"""
     size: int = 30_000
@@ -77,7 +77,7 @@ class DataConvert:
     """Write logged flights in another form."""
 
     source: Source
-    """fixed or layouts, a .parquet or .npz file, a .mapped directory, or the id of a Minari dataset"""
+    """fixed, layouts or realistic, a .parquet or .npz file, a .mapped directory, or the id of a Minari dataset"""
     target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PATH|MINARI_ID")]
     """.parquet or .npz file, .mapped directory, or the id of a new Minari dataset (whole episodes only)"""
     scenario: str | None = None

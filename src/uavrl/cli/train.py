@@ -36,7 +36,7 @@ class Train:
     out: Path
     """directory of the run: checkpoint, metrics.jsonl and, where asked for, tensorboard"""
     data: str = "layouts"
-    """layouts or fixed (built in), a .parquet or .npz file, a .mapped directory, or the id of a Minari dataset"""
+    """layouts, fixed or realistic, a .parquet or .npz file, a .mapped directory, or the id of a Minari dataset"""
     size: int | None = None
     """transitions to draw and learn from, in memory; by default 30,000 of a built-in data set, all of any other"""
     quality: Literal["mixed", "good", "bad"] = "mixed"
@@ -66,7 +66,7 @@ class Train:
 
     def run(self) -> None:
         from uavrl.agents.registry import preset
-        from uavrl.datasets import load_source, select
+        from uavrl.datasets import builtin_names, load_source, select
         from uavrl.training.checkpoint import recover
         from uavrl.training.health import summary
         from uavrl.training.log import progress, read_metrics, require_tensorboard
@@ -76,7 +76,7 @@ class Train:
         if self.tensorboard:
             require_tensorboard()  # before anything that takes long
         transitions, scenario = load_source(self.data, self.scenario)
-        size = self.size if self.size is not None else (30_000 if self.data in ("fixed", "layouts") else None)
+        size = self.size if self.size is not None else (30_000 if self.data in builtin_names() else None)
         if size is not None:
             transitions = select(transitions, size, self.quality, self.data_seed)
         elif self.quality != "mixed":

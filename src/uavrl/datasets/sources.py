@@ -18,8 +18,8 @@ _BUILTIN = resources.files("uavrl.datasets") / "builtin"
 
 
 def builtin_names() -> tuple[str, ...]:
-    """Names of the data installed with the package: one layout, and many."""
-    return ("fixed", "layouts")
+    """Names of the data installed with the package: one layout, many, and many under the scenario `realistic`."""
+    return ("fixed", "layouts", "realistic")
 
 
 def load_builtin(name: str, size: int = 30_000, quality: Quality = "mixed", seed: int = 0) -> Transitions:
