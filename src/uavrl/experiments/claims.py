@@ -210,12 +210,18 @@ def _sizes(figure: str, protocol: str, names: Sequence[str], near: bool) -> Call
 
 def _quality(better: str, worse: str, name: str, others: Sequence[str]) -> Callable[[Results], Finding]:
     """`name` beats `others` on the log `better`, and not on `worse` where that is named."""
+    return _both(*(_quality_in(figure, better, worse, name, others) for figure in ("quality", "quality-published")))
 
+
+def _quality_in(figure: str, better: str, worse: str, name: str, others: Sequence[str]) -> Callable[[Results], Finding]:
     def judge(results: Results) -> Finding:
-        here = {other: results.ahead("quality", f"{name} @ {better}", f"{other} @ {better}") for other in others}
-        text, verdicts = f"{better} log: {name} ahead of {_listed(here)}", [_verdict([*here.values()])]
+        here = {other: results.ahead(figure, f"{name} @ {better}", f"{other} @ {better}") for other in others}
+        text, verdicts = (
+            f"{_where(figure)}: {better} log: {name} ahead of {_listed(here)}",
+            [_verdict([*here.values()])],
+        )
         if worse:
-            there = {other: results.ahead("quality", f"{other} @ {worse}", f"{name} @ {worse}") for other in others}
+            there = {other: results.ahead(figure, f"{other} @ {worse}", f"{name} @ {worse}") for other in others}
             text += f"; {worse} log: behind by {_listed(there)}"
             verdicts.append(_verdict([*there.values()]))
         verdict = verdicts[0] if len(set(verdicts)) == 1 else FAILS if FAILS in verdicts else OPEN

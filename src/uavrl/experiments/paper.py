@@ -325,6 +325,7 @@ FIGURES: dict[str, Figure] = {
         "Weights of the penalty and of cloning, as published", _at(Plan.variants, "published"), "curves"
     ),
     "sizes-published": Figure("Rows to learn from, as published", _at(Plan.sizes, "published"), "lines", "rows"),
+    "quality-published": Figure("Good and bad logs, as published", _at(Plan.qualities, "published"), "bars", "log"),
 }
 
 
