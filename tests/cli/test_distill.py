@@ -53,7 +53,7 @@ def test_a_teacher_gets_a_student(runs: Path, tmp_path: Path, capsys: pytest.Cap
     [
         (["BC"], "is of agent 'bc', allowed: diffusion_sac"),
         (["nowhere"], "nowhere"),
-        (["TEACHER", "--data", "WIDE"], "has devices = 5, allowed: 4, as the teacher's"),
+        (["TEACHER", "--data", "WIDE"], "has shape (60, 10), allowed: (60, 8)"),
         (["TEACHER", "--set", "q_weight=-1"], "'q_weight' = -1"),
         (["TEACHER", "--set", "teacher.network.width=9"], "network must be that of the teacher"),
         (["TEACHER", "--updates", "0"], "'updates' = 0"),

@@ -115,6 +115,8 @@ def test_a_level_per_second_is_the_same_for_any_cut_of_the_time_into_steps() -> 
     halves = seen(torch.tensor([-1.0, -3.0]), torch.tensor([2.0, 1.0]))
     assert halves.sum() == pytest.approx(float(whole))
     assert RewardTransform.fitted(REWARD, DURATION_S, config, True).level == 0.0
+    held = seen._replace(clip=3.0)(torch.from_numpy(REWARD), torch.from_numpy(DURATION_S))  # -14, 10, 20, 0, -5
+    np.testing.assert_allclose(held.numpy(), [-1.5, 3.0, 6.0, 0.0, -0.75])  # at most 3 a second
 
 
 def test_equal_rewards_do_not_divide_by_zero() -> None:

@@ -15,16 +15,27 @@ def test_an_objective_a_step_changes_nothing() -> None:
     assert for_objective(config, load_scenario("released")) is config
 
 
-@pytest.mark.parametrize("config", [SacConfig(), preset("diffusion_sac", "default"), preset("iql", "default")])
+@pytest.mark.parametrize("config", [SacConfig(), preset("iql", "default"), preset("bcq", "default")])
 def test_a_typical_step_keeps_its_discount_and_the_scale_of_its_reward(config: SacConfig) -> None:
     found = for_objective(config, PER_SECOND)
     assert found.discount_per == "second"
-    assert found.discount**STEP_S == pytest.approx(config.discount)
+    assert found.discount == pytest.approx(min(0.99, config.discount ** (1 / STEP_S)))
     assert found.reward.scale * STEP_S == pytest.approx(config.reward.scale)  # a second's cost is that of a step
-    same = {"discount": config.discount, "discount_per": "step", "reward": config.reward}
-    assert found.model_copy(update=same) == config
+    assert config.reward.clip is not None and found.reward.clip is not None
+    assert found.reward.clip * STEP_S == pytest.approx(config.reward.clip)
+    assert found.polyak == min(0.05, config.polyak)
+    changed = ("discount", "discount_per", "polyak", "reward")
+    assert found.model_copy(update={name: getattr(config, name) for name in changed}) == config
 
 
-def test_settings_that_are_of_seconds_already_stay() -> None:
+def test_a_level_is_not_pinned_by_the_second() -> None:
+    config = preset("diffusion_sac", "default")
+    assert config.pinned_level  # type: ignore[union-attr]  # Diffusion-SAC's
+    assert not for_objective(config, PER_SECOND).pinned_level  # type: ignore[union-attr]  # the same
+
+
+def test_settings_that_are_of_seconds_or_chosen_by_hand_stay() -> None:
     config = SacConfig(discount=0.97, discount_per="second")
     assert for_objective(config, PER_SECOND) is config
+    assert for_objective(SacConfig(), PER_SECOND, ["polyak=0.1", "discount_per=step"]) == SacConfig()
+    assert for_objective(SacConfig(), PER_SECOND, ["discount=0.97"]).discount_per == "second"

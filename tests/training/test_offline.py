@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,12 @@ from uavrl.agents.base import Batch, Metrics
 from uavrl.agents.bc import BcConfig
 from uavrl.agents.diffusion_actor import DiffusionConfig
 from uavrl.agents.diffusion_sac import DiffusionSacConfig
-from uavrl.datasets import MappedTransitions, Transitions, save_mapped
+from uavrl.agents.registry import preset
+from uavrl.datasets import MappedTransitions, Transitions, load_builtin, save_mapped
 from uavrl.errors import CheckpointError, ConfigError, DivergenceError
+from uavrl.scenario import load_scenario
 from uavrl.training.checkpoint import agent_tensors, load_checkpoint
+from uavrl.training.objective import for_objective
 from uavrl.training.offline import OfflineLearner, TrainConfig
 from uavrl.training.policy import AgentPolicy, load_policy
 
@@ -344,8 +348,9 @@ def test_what_a_run_is_judged_by_follows_from_settings_and_data(
 def test_discounting_per_second_is_judged_by_the_shortest_step(flown: Transitions) -> None:
     changes = {"discount": 0.9, "discount_per": "second", "reward": {"transform": "none", "clip": 1.0}}
     learner = OfflineLearner(config(agent=changes), flown)
-    longest = 1.0 / (1.0 - 0.9 ** float(flown.duration_s.min()))
-    assert learner.expected.q[0] == pytest.approx(-longest, rel=1e-5)
+    horizon = 1.0 / (1.0 - 0.9 ** float(flown.duration_s.min()))
+    least = max(float(flown.reward.min()), -float(flown.duration_s.max()))  # at most 1 a second
+    assert learner.expected.q[0] == pytest.approx(least * horizon, rel=1e-5)
 
 
 def test_evaluation_seeds_are_refused() -> None:
@@ -356,8 +361,30 @@ def test_evaluation_seeds_are_refused() -> None:
 def test_the_level_is_pinned_only_where_no_flight_can_end_by_itself(flown: Transitions) -> None:
     plan = config(agent={"pinned_level": True})
     assert OfflineLearner(plan, flown).agent.config == plan.agent
-    ends = plan.model_copy(update={"scenario": SCENARIO.replace(energy_budget_j=1e6)})
-    assert not OfflineLearner(ends, flown).agent.config.pinned_level  # type: ignore[attr-defined]  # Diffusion-SAC's
+    ended = replace(
+        flown, terminated=np.arange(len(flown)) == 3, truncated=flown.truncated & (np.arange(len(flown)) != 3)
+    )
+    weak, strong = SCENARIO.replace(energy_budget_j=1e3), SCENARIO.replace(energy_budget_j=1e9, max_transmission_s=2.0)
+    for scenario, data, level in ((weak, flown, False), (strong, flown, True), (strong, ended, False)):
+        learner = OfflineLearner(plan.model_copy(update={"scenario": scenario}), data)
+        assert learner.agent.config.pinned_level == level  # type: ignore[attr-defined]  # Diffusion-SAC's
+        assert (learner.seen.level != 0) == level
+
+
+def test_a_reward_per_second_is_centred_by_the_second_where_no_battery_can_end_a_flight() -> None:
+    rows = load_builtin("realistic", 500)
+    scenario = load_scenario("realistic")
+    agent = for_objective(preset("diffusion_sac", "default"), scenario)
+    learner = OfflineLearner(TrainConfig(scenario=scenario, agent=agent, updates=2), rows)
+    level = float(np.median(rows.reward / rows.duration_s))
+    assert learner.seen.level == pytest.approx(level)
+    bound = 10.0 / 0.4 * rows.duration_s
+    expected = np.clip((rows.reward - level * rows.duration_s) / 0.4, -bound, bound)
+    np.testing.assert_allclose(learner.sample.reward.numpy(), expected, rtol=1e-4, atol=1e-4)
+    learner.step()
+    still = replace(rows, duration_s=np.zeros_like(rows.duration_s))
+    with pytest.raises(ConfigError, match="steps of 0 s"):
+        OfflineLearner(learner.config, still)
 
 
 @pytest.mark.parametrize(("name", "kind"), [("diffusion_sac", "devices"), ("diffusion_sac", "mlp"), ("bc", "devices")])

@@ -51,7 +51,7 @@ class Collect:
             require_tensorboard()
         width = 256 if self.network == "mlp" else 64
         scenario = load_scenario(self.scenario)
-        agent = for_objective(SacConfig(network=NetworkConfig(kind=self.network, width=width)), scenario)
+        agent = for_objective(SacConfig(network=NetworkConfig(kind=self.network, width=width)), scenario, self.set)
         config = pydantic_config(
             CollectConfig,
             scenario=scenario,

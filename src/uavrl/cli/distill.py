@@ -25,7 +25,7 @@ class Distill:
     out: Path
     """directory of the student's run: checkpoint and metrics.jsonl"""
     data: str = "layouts"
-    """flights to practise on, as the teacher's: layouts or fixed (built in), a file, or the id of a Minari dataset"""
+    """flights to practise on, of the teacher's scenario: layouts, fixed or realistic (built in), a file, a Minari id"""
     updates: int = UPDATES
     """gradient steps, some 25 ms each on one core"""
     seed: int = 0
@@ -45,7 +45,7 @@ class Distill:
         from uavrl.training.checkpoint import checkpoint_in, load_checkpoint, recover
         from uavrl.training.log import progress
         from uavrl.training.offline import OfflineLearner, TrainConfig
-        from uavrl.training.policy import load_agent
+        from uavrl.training.policy import load_agent, trained_scenario
 
         place = checkpoint_in(self.checkpoint)
         checkpoint = load_checkpoint(place)
@@ -53,7 +53,7 @@ class Distill:
         if not isinstance(teacher, DiffusionSac):
             agent = checkpoint.document["agent"]
             raise ConfigError(f"'{self.checkpoint}' is of agent '{agent}', allowed: diffusion_sac")
-        transitions, scenario = load_source(self.data)
+        transitions, scenario = load_source(self.data, trained_scenario(place))
         shared = {name: getattr(teacher.config, name) for name in ("network", "reward", "batch_size")}
         config = pydantic_config(
             TrainConfig,
@@ -68,15 +68,11 @@ class Distill:
         if recover(self.out / "checkpoint") is not None:
             raise ConfigError(f"--out '{self.out}' holds a run already; give another directory")
         learner = OfflineLearner(config, transitions, self.device)
-        if learner.agent.spaces != teacher.spaces:
-            raise ConfigError(
-                f"--data {self.data} has devices = {scenario.traffic.devices}, "
-                f"allowed: {teacher.spaces.choices - 1}, as the teacher's"
-            )
         assert isinstance(learner.agent, OneStep)  # noqa: S101  # for the type checker
         learner.agent.learn_from(teacher)
         trial = trial_flights(transitions, scenario) if self.evaluate_every else None
         with progress("distill", config.updates, "update") as report:
             learner.run(self.out, report, trial)
         print(f"{learner.updates:,} updates; policy of one step in {self.out}")
-        print(f"next: uavrl evaluate --policy {self.checkpoint} --policy {self.out} --deterministic")
+        where = "" if scenario.name == "released" else f" --scenario {scenario.name}"
+        print(f"next: uavrl evaluate --policy {self.checkpoint} --policy {self.out} --deterministic{where}")

@@ -83,10 +83,12 @@ class Train:
             raise ConfigError(f"--quality {self.quality} needs --size")
         updates = PRESET_UPDATES[self.preset] if self.updates is None else self.updates
         agent = preset(self.agent, self.preset)
+        if self.preset == "default":
+            agent = for_objective(agent, scenario, self.set)
         config = pydantic_config(
             TrainConfig,
             scenario=scenario,
-            agent=with_settings(agent if self.preset == "paper" else for_objective(agent, scenario), self.set),
+            agent=with_settings(agent, self.set),
             updates=updates,
             seed=self.seed,
             log_every=min(LOG_EVERY, max(1, updates // 50)),  # enough rows to judge a short run by

@@ -131,7 +131,7 @@ def _learn_offline(run: Run, setting: Setting, directory: Path) -> tuple[Policy,
         updates=run.updates,
         seed=run.seed,
         evaluate_every=every,
-        save_every=min(1_000, every or run.updates),
+        save_every=min(1_000, every or max(1, run.updates // 8)),
     )
     transitions = learned_from(setting.data, setting.scenario)
     learner = OfflineLearner.resume(directory, transitions) or OfflineLearner(plan, transitions)

@@ -21,7 +21,7 @@ from uavrl.evaluation.statistics import (
     resampling,
     run_mean,
 )
-from uavrl.experiments.flights import flown
+from uavrl.experiments.flights import Setting, flown
 from uavrl.experiments.paper import OURS, ROUND_ROBIN, YARDSTICK
 from uavrl.experiments.runner import Row, grouped
 
@@ -91,19 +91,23 @@ def estimated(values: Float, name: str = "") -> Estimate:
     return Estimate(environments.point, environments.replicates + (seeds.replicates - seeds.point))
 
 
+_FAIRNESS = {"Jain 1/age": "jain_age", "worst device, s": "worst_device_age_s"}
+# Columns and their metrics, by what the objective counts: policies take different numbers of steps in equal times
+PER_STEP = {"age per step, s": "age_per_step_s", "energy per step, J": "energy_per_step_j"} | _FAIRNESS
+PER_SECOND = {"age per second, s": "age_per_second_s", "energy a flight, J": "energy_per_episode_j"} | _FAIRNESS
+
+
 def table(rows: Sequence[Row], ours: str = OURS) -> list[list[str]]:
     """`compare` in words: a header, then a line a variant."""
+    per_second = Setting.model_validate(rows[0]["options"]).scenario.objective.reward == "per_second"
+    metrics = PER_SECOND if per_second else PER_STEP
     header = [
         "policy", "seeds", "return", "IQM", "over the planner, %", "0 TDM .. 100 planner", f"{ours} ahead by",
-        f"P({ours} better)", "the other action", "age per step, s", "energy per step, J", "Jain 1/age",
-        "worst device, s",
+        f"P({ours} better)", "the other action", *metrics,
     ]  # fmt: skip
     lines, groups = [header], grouped(rows)
     for one in compare(rows, ours):
-        means = [
-            _mean(scores(groups[one.name], metric))
-            for metric in ("age_per_step_s", "energy_per_step_j", "jain_age", "worst_device_age_s")
-        ]
+        means = [_mean(scores(groups[one.name], metric)) for metric in metrics.values()]
         seeds = f"{one.seeds}" if one.seeds else ""
         lines.append(
             [

@@ -79,10 +79,10 @@ class MappedRows:
 
 
 class RewardTransform(NamedTuple):
-    """From logged rewards to what an agent learns from: clip(factor (r - level T)).
+    """From logged rewards to what an agent learns from: factor (r - level T), held within clip T of 0.
 
-    T is 1 where the agent discounts by steps, and a step's duration (s) where it discounts by seconds: only then does
-    the level, which each flight of a fixed time loses as often, prefer neither short steps nor long ones.
+    T is 1 where the agent discounts by steps, and a step's duration (s) where it discounts by seconds: only then do the
+    level, which each flight of a fixed time loses as often, and the clip prefer neither short steps nor long ones.
     """
 
     level: float  # a step, or a second
@@ -110,5 +110,6 @@ class RewardTransform(NamedTuple):
 
     def __call__(self, reward: torch.Tensor, duration_s: torch.Tensor) -> torch.Tensor:
         """What the agent sees of rewards and durations (n,)."""
-        moved = self.factor * (reward - self.level * (duration_s if self.per_second else 1.0))
-        return moved if self.clip is None else moved.clamp(-self.clip, self.clip)
+        time = duration_s if self.per_second else torch.ones_like(reward)
+        moved = self.factor * (reward - self.level * time)
+        return moved if self.clip is None else moved.clamp(-self.clip * time, self.clip * time)

@@ -86,7 +86,9 @@ class OfflineLearner:
         least, most = transitions.reward.min(), transitions.reward.max()  # first: mapped files are read in order
         self.shortest_s, longest_s = float(transitions.duration_s.min()), float(transitions.duration_s.max())
         known = transitions.sample(SAMPLE_ROWS) if isinstance(transitions, MappedTransitions) else transitions
-        terminates = may_terminate(config.scenario)
+        if config.agent.discount_per == "second" and self.shortest_s <= 0:
+            raise ConfigError("discount_per = 'second', but the data have steps of 0 s; allowed then: 'step'")
+        terminates = may_terminate(config.scenario) or bool(known.terminated.any())
         self.seen = RewardTransform.fitted(known.reward, known.duration_s, config.agent, terminates)
 
         def encode(rows: Transitions) -> Batch:
