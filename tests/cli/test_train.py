@@ -54,6 +54,24 @@ def test_a_flat_file_becomes_a_policy(folder: Path, agent: str, capsys: pytest.C
     assert "health unknown: 4 rows in the log" in captured.out
 
 
+@pytest.mark.parametrize(
+    ("words", "per", "discount"),
+    [
+        ([], "second", 0.99),
+        (["--set", "discount=0.98"], "second", 0.98),
+        (["--set", "discount_per=step"], "step", 0.9995),
+        (["--preset", "paper"], "step", 0.99),
+    ],
+)
+def test_a_reward_per_second_is_discounted_by_the_second(
+    folder: Path, words: list[str], per: str, discount: float
+) -> None:
+    data = ["--data", "realistic", "--size", "200", "--updates", "1", *SMALL[:-2], *words]
+    assert train("diffusion_sac", "--out", "runs/mine", *data) == 0
+    config = load_checkpoint(folder / "runs/mine/checkpoint").document["config"]
+    assert (config["discount_per"], config["discount"]) == (per, discount)
+
+
 def test_mapped_flights_train_to_the_same_policy_and_resume(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

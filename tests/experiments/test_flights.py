@@ -81,8 +81,9 @@ def test_a_run_that_was_interrupted_ends_as_if_it_had_not_been(tmp_path: Path, m
         assert parts[name] == whole[name]
 
 
+@pytest.mark.parametrize("points", [2, 0])
 def test_a_training_that_diverges_is_judged_by_its_last_good_checkpoint(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    points: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     step = OfflineLearner.step
 
@@ -91,8 +92,10 @@ def test_a_training_that_diverges_is_judged_by_its_last_good_checkpoint(
         return metrics | ({"critic_loss": np.inf} if learner.updates > 5 else {})
 
     monkeypatch.setattr(OfflineLearner, "step", explodes)
-    scores = measure(learned("Diffusion-SAC"), tmp_path)
+    run = learned("Diffusion-SAC")
+    scores = measure(run.model_copy(update={"options": run.options | {"points": points}}), tmp_path)
     assert "critic_loss = inf" in scores["diverged"]
+    assert ("curve" in scores) == (points > 0)
     assert np.isfinite(scores["flown"]["return"]).all()
 
 

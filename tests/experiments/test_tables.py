@@ -58,6 +58,18 @@ def test_the_table_has_a_line_a_policy_and_says_who_diverged() -> None:
     assert scores([rows[0]], "return").shape == (1, 12)
 
 
+def test_an_objective_a_second_is_shown_a_second() -> None:
+    """Energy and age a step would tell who takes short steps."""
+    rows = [row(run) for run in PLAN.comparison(PROTOCOLS["realistic"])]
+    for one in rows:
+        one["scores"]["flown"]["energy_per_episode_j"] = [7.5e4] * 12
+    header, first, *_ = table(rows)
+    assert "age per second, s" in header
+    assert first[header.index("energy a flight, J")] == "7.5e+04"
+    assert not {"age per step, s", "energy per step, J"} & set(header)
+    assert "age per step, s" in table(ROWS)[0]
+
+
 @pytest.mark.parametrize(
     ("value", "text"),
     [

@@ -159,7 +159,12 @@ def test_recentring_moves_the_level_of_q_and_no_difference() -> None:
 
 @pytest.mark.parametrize(
     ("transform", "scenario", "centred"),
-    [("centred", SCENARIO, True), ("none", SCENARIO, False), ("centred", SCENARIO.replace(energy_budget_j=1e6), False)],
+    [
+        ("centred", SCENARIO, True),
+        ("none", SCENARIO, False),
+        ("centred", SCENARIO.replace(energy_budget_j=1e6), False),
+        ("centred", SCENARIO.replace(energy_budget_j=1e6, max_transmission_s=2.0), True),
+    ],
 )
 def test_rewards_are_centred_where_asked_and_where_no_flight_ends_by_itself(
     transform: str, scenario: Scenario, centred: bool, tmp_path: Path

@@ -149,8 +149,8 @@ def _learn_offline(run: Run, setting: Setting, directory: Path) -> tuple[Policy,
             raise
         scores["diverged"] = str(error)
         policy = load_policy(directory, setting.scenario)
-    rows = [row for row in read_metrics(directory / "metrics.jsonl") if SHOWN[0] in row]
-    if rows:
+    if setting.points:
+        rows = [row for row in read_metrics(directory / "metrics.jsonl") if SHOWN[0] in row]
         scores["curve"] = {"at": [row["step"] for row in rows]} | {
             name: _short(np.array([row[name] for row in rows])) for name in SHOWN
         }
