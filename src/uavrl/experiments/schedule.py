@@ -11,6 +11,7 @@ from rich.table import Table
 from uavrl.experiments.flights import Setting
 from uavrl.experiments.paper import FIGURES
 from uavrl.experiments.runner import Row, Run
+from uavrl.training.objective import STEP_S
 
 # Seconds of one core (AMD EPYC without AVX-512) an update, by agent and network, until a run of the kind has finished
 _UPDATE_S = {
@@ -38,10 +39,12 @@ def kind(run: Run) -> tuple[Any, ...]:
 def estimated_s(run: Run) -> float:
     """Core-seconds of a run of which nothing is known."""
     setting, settings = Setting.model_validate(run.options), run.settings
-    flights = setting.episodes * (setting.fading_seeds + setting.points + 1)
+    limits = setting.scenario.limits
+    length = (limits.max_steps or (limits.time_budget_s or 0.0) / STEP_S) / 400
+    flights = length * setting.episodes * (setting.fading_seeds + setting.points + 1)
     if run.problem == "policy":
         a_flight = _PLANNED_S if settings["policy"] == "planner" else _FLOWN_S
-        return setting.episodes * setting.fading_seeds * a_flight
+        return setting.episodes * setting.fading_seeds * length * a_flight
     if run.problem == "online":
         return run.updates * _FLIGHT_S + flights * _FLOWN_S
     an_update = _UPDATE_S.get((settings["name"], settings["network"]["kind"]), _OTHER_UPDATE_S)
