@@ -222,9 +222,13 @@ def _spanned(points: Sequence[Point]) -> list[float]:
     return [p["mean"] for p in points if not p["seeds"] and p["name"] in (ROUND_ROBIN, YARDSTICK)]
 
 
+_LETTERS = 92  # of a legend's line across the page
+
+
 def _legend(canvas: Canvas, axes: Axes, count: int) -> None:
     handles, labels = axes.get_legend_handles_labels()
-    canvas.legend(handles, labels, loc="outside upper center", ncols=min(count, 7), frameon=False, handlelength=1.6)
+    columns = min(count, max(1, _LETTERS // max(map(len, labels), default=1)))  # wider, it would shrink the panels
+    canvas.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False, handlelength=1.6)
 
 
 def _lines(figure: Figure, points: Sequence[Point]) -> Canvas:
