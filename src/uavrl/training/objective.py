@@ -10,7 +10,7 @@ from uavrl.agents.diffusion_sac import DiffusionSacConfig
 from uavrl.scenario import Scenario
 
 STEP_S = 0.4  # mean duration of a step in the built-in logs of `released`, where our presets were found
-MOST_DISCOUNT, FASTEST_POLYAK = 0.99, 0.05  # a second; an update. Beyond them training diverged (docs/what-matters.md)
+MOST_DISCOUNT, FASTEST_POLYAK = 0.99, 0.05  # a second; an update: docs/what-matters.md
 
 Config = TypeVar("Config", bound=AgentConfig)
 
