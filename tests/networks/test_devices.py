@@ -106,6 +106,12 @@ def run(network: Network, s: Devices, w: Tensor, own: Tensor) -> Tensor:
         return network(s, w, own)
 
 
+def twins_of(s: Devices) -> Devices:
+    """Each device and its twin, with ages of a round that takes twice as long."""
+    older = s["devices"] * torch.tensor([1.0, 1.0, 2.0, 1.0, 1.0, 1.0])
+    return {"uav": s["uav"], "devices": torch.cat([older, older], dim=1)}
+
+
 def test_reordered_devices_reorder_the_outputs_and_change_nothing_else(network: Network) -> None:
     s, w, own = seen(), noise(1, ROWS, 2), noise(2, ROWS, K)
     order = torch.tensor([3, 0, 4, 1, 2])
@@ -125,9 +131,12 @@ def test_the_same_weights_take_another_number_of_devices(network: Network, other
 
 @pytest.mark.parametrize("make", [critic, denoiser, actor, choice_actor])
 def test_a_twin_of_each_device_changes_no_pooled_mean(make: Callable[[], Network]) -> None:
-    """Every device twice: means over the set stay, so each output stays; a sum or a count would change them."""
+    """Every device twice, as old as a round is long: means over the set stay, so each output stays.
+
+    A sum, a count, or ages that are not by the number of devices would change them.
+    """
     s, w, own = seen(), noise(1, ROWS, 2), noise(2, ROWS, K)
-    twice = {"uav": s["uav"], "devices": torch.cat([s["devices"], s["devices"]], dim=1)}
+    twice = twins_of(s)
     network = make()
     once, found = run(network, s, w, own), run(network, twice, w, torch.cat([own, own], dim=1))
     torch.testing.assert_close(found[:, : K + 1], once, rtol=1e-4, atol=1e-5)
@@ -162,7 +171,7 @@ def test_a_function_without_a_choice_is_one_of_the_set() -> None:
         padding[:, :, 5] = 0.0
         for other in (
             s["devices"][:, [3, 0, 4, 1, 2]],
-            s["devices"].repeat(1, 2, 1),
+            twins_of(s)["devices"],
             torch.cat([s["devices"], padding], 1),
         ):
             found = made(made.encode({"uav": s["uav"], "devices": other}), w)
@@ -244,7 +253,7 @@ def test_features_against_numbers_worked_out_by_hand() -> None:
     devices = torch.tensor(
         [
             [
-                [300.0, 400.0, torch.e**2 - 1, 1.5, 2.0, 1.0],
+                [300.0, 400.0, (torch.e**2 - 1) / 5, 1.5, 2.0, 1.0],  # 2 valid devices: ages count 10 / 2 times
                 [0.0, -500.0, 0.0, 0.5, 4.0, 1.0],
                 [9.0, 9.0, 99.0, 9.0, 9.0, 0.0],
             ]

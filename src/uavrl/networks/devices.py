@@ -26,6 +26,7 @@ from uavrl.networks.mlp import bounded_log_std, choice_output, step_embedding
 
 TOKEN_FEATURES = 9
 GLOBAL_FEATURES = 7
+REFERENCE_DEVICES = 10  # whose ages enter as they are: the K of the built-in data
 NEVER = -1e4  # logit and Q of a padded device
 
 
@@ -39,19 +40,21 @@ def features(observation: Observation, scale_m: float) -> tuple[Tensor, Tensor, 
     """Tokens (B, K, 9), globals (B, 7), validity (B, K) and relative positions in metres (B, K, 2).
 
     Ages enter as log(1 + age), as they are, and as a share of the oldest: absolute for the value, relative for whom to
-    serve.
+    serve. They are scaled by `REFERENCE_DEVICES` / K first: of K devices served in turn each waits K services, so a
+    round looks the same whatever K, and a policy flies with more or fewer devices than it was trained with.
     """
     if not isinstance(observation, dict):
         raise TypeError('a set network takes observation = "devices"')
     uav, devices = observation["uav"], observation["devices"]
-    offset, age, valid = devices[..., :2], devices[..., 2], devices[..., 5]
+    offset, valid = devices[..., :2], devices[..., 5]
+    count = valid.sum(dim=1, keepdim=True)
+    age = devices[..., 2] * (REFERENCE_DEVICES / count)
     log_age = torch.log1p(age) * valid
     plain_age = age.clamp(max=20.0) / 5.0 * valid  # returns are sums of ages: linear where flights mostly are
     oldest = (age * valid).amax(dim=1, keepdim=True)
     share = age * valid / (oldest + 1e-3)
     own = torch.stack([log_age, plain_age, share, devices[..., 3], devices[..., 4] / 2.0, valid], dim=-1)
     tokens = torch.cat([_place(offset, scale_m), own], dim=-1)
-    count = valid.sum(dim=1, keepdim=True)
     globals_ = torch.cat(
         [
             uav[:, :2] / scale_m - 1.0,
