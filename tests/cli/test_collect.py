@@ -75,6 +75,7 @@ def test_interrupted_it_goes_on_where_it_was(
         ([], ["--out"]),
         (["--out", "o", "--scenario", "mars"], ["'mars'"]),
         (["--out", "o", "--episodes", "0"], ["episodes", "0"]),
+        (["--out", "o", "--steps-per-update", "0"], ["steps_per_update", "0"]),
         (["--out", "o", "--seed", "1000000"], ["seed", "1000000"]),
         (["--out", "o", "--layouts", "moving"], ["moving", "fixed"]),
         (["--out", "o", "--set", "discount=1"], ["discount", "1", "less than 1"]),
@@ -97,6 +98,7 @@ def test_wrong_input_is_one_line_and_code_2(
 def test_a_directory_of_another_run_is_left_alone(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert collect("--out", "run", *SMALL) == 0
     assert collect("--out", "run", *SMALL, "--seed", "1") == 2
+    assert collect("--out", "run", *SMALL, "--steps-per-update", "4") == 2
     assert "holds a run of other settings" in capsys.readouterr().err
 
 

@@ -30,6 +30,8 @@ class Collect:
     """a network over the set of devices, or the paper's perceptron on its K + 3 entries"""
     episodes: int = 700
     """flights to log"""
+    steps_per_update: int = 8
+    """environment steps for each gradient step; more where flights are long"""
     seed: int = 0
     """of layouts, starts, fading, exploration and weights; below 1,000,000"""
     set: Many = ()
@@ -58,6 +60,7 @@ class Collect:
             layouts=self.layouts,
             agent=with_settings(agent, self.set),
             episodes=self.episodes,
+            steps_per_update=self.steps_per_update,
             seed=self.seed,
         )
         output_directory(self.out)
