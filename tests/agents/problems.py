@@ -75,6 +75,9 @@ def agent(name: str, kind: Kind, *, seed: int = 0, devices: int = DEVICES, **cha
     if name == "one_step":
         changes = {"teacher": DiffusionSacConfig(network=shape, diffusion=DiffusionConfig(steps=3))} | changes
         shape = changes["teacher"].network
+        width = changes.pop("width", None)
+        if width is not None:  # a student may be narrower than its teacher
+            shape = shape.model_copy(update={"width": width})
     config = CONFIGS[name](network=shape, **changes)
     torch.manual_seed(seed)
     made = make_agent(spaces(kind, devices), config)

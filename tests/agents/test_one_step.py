@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from tests.agents.problems import DEVICES, KINDS, Kind, agent, batch, copies, diffusion_sac, disturb, equal, noise
+from uavrl.actions import decode
 from uavrl.agents.one_step import OneStep, OneStepConfig
 from uavrl.networks import NetworkConfig
 
@@ -43,6 +44,46 @@ def test_the_loss_is_the_weighted_distance_to_the_teachers_map(kind: Kind) -> No
     assert float(loss) == pytest.approx(float((error.mean(axis=0) * weight).sum() / weight.sum()), rel=1e-5)
     assert float(metrics["distance"]) == float(loss)
     assert "guided_q" not in metrics
+
+
+def teachers_decisions(made: OneStep, data: Any, start: Tensor) -> Any:
+    """What the teacher answers to x_M = start, its critic's device and its null action included."""
+    actor = made.teacher.actor
+    context = actor.average.encode(data.observation)
+    vector = actor.average.possible(context, actor.map(actor.average, context, start))
+    return made.teacher.best(data.observation, decode(vector, 2), 1)
+
+
+@BOTH
+def test_a_student_that_chooses_learns_whole_decisions(kind: Kind) -> None:
+    teacher = diffusion_sac(kind, null_candidate=True).config
+    made = student(kind, choice="student", displacement_weight=4.0, teacher=teacher)
+    disturb(made.teacher.critic, 3)
+    data, start = batch(kind, ROWS), noise(5, ROWS, SIZE)
+    w, d = teachers_decisions(made, data, start)
+    answer = made.map(made.student, made.student.encode(data.observation), start).detach().double()
+    squared = ((answer[:, :2] - w) ** 2).mean()
+    likelihood = answer[:, 2:].log_softmax(dim=1)[range(ROWS), d].mean()
+    loss = made.student_loss(data, start)[0].detach()
+    assert float(loss) == pytest.approx(float(4.0 * squared - likelihood), rel=1e-5)
+
+
+@BOTH
+def test_a_student_that_chooses_asks_no_critic_and_holds_its_place_when_idle(kind: Kind) -> None:
+    teacher = diffusion_sac(kind, null_candidate=True).config
+    made = student(kind, choice="student", teacher=teacher)
+    disturb(made.average, 8)
+    for parameter in made.teacher.critic.parameters():
+        parameter.data.fill_(float("nan"))
+    seen, generator = batch(kind, 200).observation, torch.Generator().manual_seed(0)
+    action = made.act(seen, generator=generator)
+    idle = action.choice == 0
+    assert 0 < idle.sum() < 200
+    assert (action.continuous[idle] == 0).all()
+    assert (action.continuous[~idle] != 0).any(dim=1).all()
+    made.config = made.config.model_copy(update={"teacher": teacher.model_copy(update={"null_candidate": False})})
+    action = made.act(seen, generator=generator.manual_seed(0))
+    assert (action.continuous[idle] != 0).any()  # there idling may move
 
 
 @BOTH
@@ -84,11 +125,12 @@ def test_a_share_of_the_batch_starts_from_zero(still: float, share: float, monke
 
 
 @BOTH
-def test_it_learns_to_decide_as_its_teacher(kind: Kind) -> None:
+@pytest.mark.parametrize(("choice", "width"), [("critic", None), ("student", None), ("student", 16)])
+def test_it_learns_to_decide_as_its_teacher(kind: Kind, choice: str, width: int | None) -> None:
     teacher = diffusion_sac(kind)
     disturb(teacher.actor.average, 3, scale=0.15)
     disturb(teacher.critic, 4)
-    made = agent("one_step", kind, teacher=teacher.config, learning_rate=3e-3)
+    made = agent("one_step", kind, teacher=teacher.config, learning_rate=3e-3, choice=choice, width=width)
     assert isinstance(made, OneStep)
     made.learn_from(teacher)
     data, generator = batch(kind, 256), torch.Generator().manual_seed(0)
@@ -113,5 +155,10 @@ def test_the_best_of_several_answers_is_taken() -> None:
 
 
 def test_a_network_that_is_not_the_teachers_is_refused() -> None:
-    with pytest.raises(ValueError, match="network must be that of the teacher"):
-        OneStepConfig(network=NetworkConfig(width=3))
+    with pytest.raises(ValueError, match="network must be that of the teacher, but for its width"):
+        OneStepConfig(network=NetworkConfig(scale_m=3.0))
+
+
+def test_candidates_need_the_critic_that_compares_them() -> None:
+    with pytest.raises(ValueError, match="candidates = 4 needs choice = 'critic'"):
+        OneStepConfig(choice="student", candidates=4)

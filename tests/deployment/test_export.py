@@ -101,6 +101,17 @@ def test_parity_of_samples(name: str, kind: Kind, exported: Exported) -> None:
     agree(expected, policy.decide(arrays(seen), drawn.numpy()))
 
 
+def test_parity_of_a_student_that_chooses(tmp_path: Path) -> None:
+    teacher = agent("diffusion_sac", "devices", null_candidate=True).config
+    made = agent("one_step", "devices", teacher=teacher, width=16, choice="student")
+    disturb(made.networks, 7)
+    export(made, RELEASED, tmp_path / "policy.onnx")
+    seen = observation("devices", 500)
+    expected = made.act(seen, generator=torch.Generator(), deterministic=True)
+    assert 0 < (expected.choice == 0).sum() < 500
+    agree(expected, Policy(tmp_path / "policy.onnx").decide(arrays(seen)))
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_parity_of_candidates_that_are_re_ranked(tmp_path: Path) -> None:

@@ -16,8 +16,8 @@ from uavrl.training.policy import AgentPolicy, Decision, load_policy, trained_sc
 SCENARIO = load_scenario("released", devices=4, max_steps=5)
 
 
-def saved(path: Path, name: str, kind: Kind, scenario: Scenario = SCENARIO) -> AgentPolicy:
-    made = agent(name, kind, devices=scenario.traffic.devices)
+def saved(path: Path, name: str, kind: Kind, scenario: Scenario = SCENARIO, **changes: Any) -> AgentPolicy:
+    made = agent(name, kind, devices=scenario.traffic.devices, **changes)
     document = {
         "agent": name,
         "config": made.config.model_dump(mode="json"),
@@ -75,6 +75,9 @@ def test_a_decision_is_changed_at_loading_where_the_agent_can(tmp_path: Path) ->
     saved(tmp_path / "iql", "iql", "devices")
     with pytest.raises(ConfigError, match="candidates = 4, allowed for agents that re-rank; not for iql"):
         load_policy(tmp_path / "iql", SCENARIO, Decision(candidates=4))
+    saved(tmp_path / "student", "one_step", "devices", choice="student")
+    with pytest.raises(ConfigError, match="candidates = 4 needs choice = 'critic'"):
+        load_policy(tmp_path / "student", SCENARIO, Decision(candidates=4))
     with pytest.raises(ConfigError, match="null_candidate = False, allowed for Diffusion-SAC; not for iql"):
         load_policy(tmp_path / "iql", SCENARIO, Decision(null_candidate=False))
     with pytest.raises(ConfigError, match="solver = 'ddim', allowed for agents with a chain; iql has none"):

@@ -3,7 +3,9 @@ r"""One-step policy: a student that answers at once what a trained Diffusion-SAC
 After flow Q-learning (Park, Li, Levine 2025, arXiv:2502.02538). The teacher's DDIM without noise is a map from x_M to
 the vector [w, z] before its argmax; the student \mu_\omega(s, x_M) learns that map in one pass, with the teacher's Q:
     L = E|\mu_\omega(s, x_M) - DDIM_\theta(s, x_M)|^2 + q_weight L_g(\mu_\omega(s, x_M))
-An ancestral chain is no map of x_M: a squared error to it would average its modes.
+An ancestral chain is no map of x_M: a squared error to it would average its modes. With choice = "student" the
+teacher's decision takes the place of its vector, its critic's device and null action included:
+    L = E|w - w_\theta|^2 + E[-\log softmax(z)_{d_\theta}] + q_weight L_g,   (w_\theta, d_\theta) decided for x_M
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from typing import Literal, Self
 import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
+from torch.nn import functional
 
 from uavrl.actions import HybridAction, decode
 from uavrl.agents.base import Agent, AgentConfig, Batch, Metrics, adam, minimise, move_towards
@@ -24,7 +27,7 @@ from uavrl.networks.interfaces import Context
 
 
 class OneStepConfig(AgentConfig):
-    """Settings of the student; `network` and `reward` are its teacher's."""
+    """Settings of the student; `network` (but for its width) and `reward` are its teacher's."""
 
     name: Literal["one_step"] = "one_step"
     teacher: DiffusionSacConfig = DiffusionSacConfig()
@@ -34,18 +37,25 @@ class OneStepConfig(AgentConfig):
         0.75, ge=0, le=1, description="share of a batch that starts from x_M = 0, as a deterministic decision does"
     )
     displacement_weight: float = Field(3.0, gt=0, description="weight of a continuous entry in the squared error")
+    choice: Literal["critic", "student"] = Field(
+        "critic",
+        description="whom to serve: the teacher's critic says it for the student's w; or the student itself, which "
+        "learns the teacher's decisions, null action included, and at a decision asks no critic",
+    )
     student_average: float = Field(0.98, ge=0, lt=1, description="decay of the student that acts; 0: no average")
     candidates: int = Field(1, ge=1, description="actions drawn at a decision; the one of largest min Q is taken")
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        if self.network != self.teacher.network:
-            raise ValueError("network must be that of the teacher")
+        if self.network.model_copy(update={"width": self.teacher.network.width}) != self.teacher.network:
+            raise ValueError("network must be that of the teacher, but for its width")
+        if self.choice == "student" and self.candidates > 1:
+            raise ValueError(f"candidates = {self.candidates} needs choice = 'critic', which compares them; allowed: 1")
         return self
 
 
 class OneStep(Agent):
-    """A student of one pass beside its teacher, whose critic chooses the device for the student's w.
+    """A student of one pass beside its teacher, whose critic may choose the device for the student's w.
 
     Its teacher knows nothing until `learn_from`.
     """
@@ -69,9 +79,13 @@ class OneStep(Agent):
         self.optimisers = {"student": adam(self.student.parameters(), config)}
 
     def learn_from(self, teacher: DiffusionSac) -> None:
-        """Take over a trained teacher's target actor and critic; the student begins with that actor's weights."""
+        """Take over a trained teacher's target actor and critic.
+
+        A student of the same width begins with that actor's weights.
+        """
         learned = teacher.actor.average.state_dict()
-        for network in (self.teacher.actor.average, self.student, self.average):
+        alike = self.config.network == self.config.teacher.network
+        for network in (self.teacher.actor.average, *((self.student, self.average) if alike else ())):
             network.load_state_dict(learned)
         self.teacher.critic.load_state_dict(teacher.critic.state_dict())
 
@@ -82,11 +96,20 @@ class OneStep(Agent):
 
     def student_loss(self, batch: Batch, start: Tensor) -> tuple[Tensor, Metrics]:
         """The loss above; start (B, C + D) is x_M of student and teacher."""
-        config, teacher = self.config, self.teacher.actor
+        config, teacher, continuous = self.config, self.teacher.actor, self.spaces.continuous
+        encoded = self.student.encode(batch.observation)
+        answer = self.map(self.student, encoded, start)
         with torch.no_grad():
-            wanted = teacher.map(teacher.average, teacher.average.encode(batch.observation), start)
-        answer = self.map(self.student, self.student.encode(batch.observation), start)
-        distance = block_mean((answer - wanted).square(), self.spaces.continuous, config.displacement_weight)
+            context = teacher.average.encode(batch.observation)
+            wanted = teacher.map(teacher.average, context, start)
+        if config.choice == "critic":
+            distance = block_mean((answer - wanted).square(), continuous, config.displacement_weight)
+        else:
+            drawn = decode(teacher.average.possible(context, wanted), continuous)
+            decided = self.teacher.best(batch.observation, drawn, 1)
+            logits = self.student.possible(encoded, answer)[:, continuous:]
+            distance = config.displacement_weight * (answer[:, :continuous] - decided.continuous).square().mean()
+            distance = distance + functional.cross_entropy(logits, decided.choice)
         loss, metrics = distance, {"distance": distance.detach()}
         if config.q_weight > 0:
             guidance, more = self.teacher.guidance_loss(batch.observation, answer)
@@ -117,7 +140,12 @@ class OneStep(Agent):
         start = torch.zeros(shape, device=context[0].device) if noise is None else noise.reshape(shape)
         context = repeat(context, count)
         vector = self.average.possible(context, self.map(self.average, context, start))
-        return self.teacher.best(observation, decode(vector, self.spaces.continuous), count)
+        answer = decode(vector, self.spaces.continuous)
+        if self.config.choice == "critic":
+            return self.teacher.best(observation, answer, count)
+        if self.config.teacher.null_candidate:  # idling was learned from the null action, whose w = 0 no network hits
+            return answer._replace(continuous=answer.continuous * (answer.choice > 0)[:, None])
+        return answer
 
     @torch.no_grad()
     def act(self, observation: Observation, *, generator: torch.Generator, deterministic: bool = False) -> HybridAction:

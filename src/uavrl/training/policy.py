@@ -14,7 +14,7 @@ from uavrl.agents.diffusion_actor import DiffusionActor, Solver, SolverName
 from uavrl.agents.registry import AnyConfig, make_agent
 from uavrl.errors import CheckpointError, ConfigError
 from uavrl.networks import Spaces
-from uavrl.scenario import Scenario, parse_scenario
+from uavrl.scenario import Scenario, describe_validation, parse_scenario
 from uavrl.simulation.state import FlightAction
 from uavrl.training.batches import OBSERVATION_OF, to_tensors
 from uavrl.training.checkpoint import (
@@ -56,7 +56,10 @@ class Decision(BaseModel):
                 continue
             if not hasattr(agent.config, setting):
                 raise ConfigError(f"{setting} = {value}, allowed for {able}; not for {name}")
-            agent.config = agent.config.model_copy(update={setting: value})
+            try:
+                agent.config = type(agent.config).model_validate(agent.config.model_dump() | {setting: value})
+            except ValidationError as error:
+                raise ConfigError(describe_validation(error, "setting")) from None
         if self.solver is not None:
             actor = getattr(agent, "actor", None)
             if not isinstance(actor, DiffusionActor):
