@@ -319,17 +319,23 @@ class DiffusionSac(Agent):
         config = self.config
         if count == 1 and not config.greedy_choice and not config.null_candidate:
             return drawn
-        context, w = self.critic.encode(observation), drawn.continuous
-        q, choice = self._best(self.critic, repeat(context, count), drawn)
-        if count > 1:
-            rows = q.shape[0] // count
-            best = q.view(rows, count).argmax(dim=1) + count * torch.arange(rows, device=q.device)
-            q, w, choice = q[best], w[best], choice[best]
+        rows = drawn.choice.shape[0] // count
+        w, choice = drawn.continuous.view(rows, count, -1), drawn.choice.view(rows, count)
+        if config.null_candidate:  # in the same pass, last: where it is no better than another the other is taken
+            w = torch.cat([w, torch.zeros_like(w[:, :1])], dim=1)
+        each = count + int(config.null_candidate)
+        context = repeat(self.critic.encode(observation), each)
+        every = self.critic.all_choices(context, w.flatten(0, 1)).amin(dim=0).view(rows, each, -1)
+        if config.greedy_choice:
+            q, choice = every[:, :count].max(dim=2)
+        else:
+            q = every[:, :count].gather(2, choice[..., None]).squeeze(2)
         if config.null_candidate:
-            null_q = self.critic.all_choices(context, torch.zeros_like(w)).amin(dim=0)[:, 0]
-            acts = q >= null_q
-            w, choice = w * acts[:, None], choice * acts
-        return HybridAction(w, choice)
+            q = torch.cat([q, every[:, count:, 0]], dim=1)
+            choice = torch.cat([choice, torch.zeros_like(choice[:, :1])], dim=1)
+        best = q.argmax(dim=1, keepdim=True)
+        w = w.gather(1, best[..., None].expand(-1, -1, w.shape[2]))
+        return HybridAction(w.squeeze(1), choice.gather(1, best).squeeze(1))
 
     def noise_now(self) -> float:
         """Standard deviation of the action noise at this share of the training."""
