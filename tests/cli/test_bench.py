@@ -70,12 +70,15 @@ def test_the_decisions_measured_are_of_students_and_of_five_and_fifty_steps() ->
     found: dict[str, tuple[str, int]] = {}
     for name, case in decide.CASES.items():
         config = decide.settings(case)
-        assert isinstance(config, OneStepConfig if name.endswith("one_step") else DiffusionSacConfig)
+        assert isinstance(config, OneStepConfig if "one_step" in name else DiffusionSacConfig)
         steps = 1 if isinstance(config, OneStepConfig) else config.diffusion.steps
         found[name] = (config.network.kind, steps)
+        if isinstance(config, OneStepConfig):
+            assert config.choice == ("student" if name.endswith("own_choice") else "critic")
     assert found == {
         "one_step": ("mlp", 1),
         "default_one_step": ("devices", 1),
+        "default_one_step_own_choice": ("devices", 1),
         "five_step": ("mlp", 5),
         "fifty_step": ("mlp", 50),
         "default": ("devices", 5),

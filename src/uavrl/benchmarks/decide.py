@@ -6,7 +6,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -34,6 +34,7 @@ class Case(NamedTuple):
 
     preset: str
     steps: int
+    choice: Literal["critic", "student"] = "critic"  # of a student
 
 
 # The paper's perceptron, 3 x 256, decides by its chain alone; the set network of the default also asks its critic.
@@ -42,6 +43,7 @@ CASES = {
     "five_step": Case("paper", 5),
     "fifty_step": Case("paper", 50),
     "default_one_step": Case("default", 1),
+    "default_one_step_own_choice": Case("default", 1, "student"),
     "default": Case("default", 5),
 }
 
@@ -50,7 +52,8 @@ def settings(case: Case) -> DiffusionSacConfig | OneStepConfig:
     """The preset with the case's number of steps, or a student of it."""
     config = preset("diffusion_sac", case.preset)
     if case.steps == 1:
-        return OneStepConfig.model_validate({"teacher": config.model_dump(), "network": config.network})
+        student = {"teacher": config.model_dump(), "network": config.network, "choice": case.choice}
+        return OneStepConfig.model_validate(student)
     chain = config.diffusion.model_copy(update={"steps": case.steps})  # type: ignore[union-attr]  # of Diffusion-SAC
     return DiffusionSacConfig.model_validate({**config.model_dump(), "diffusion": chain.model_dump()})
 
