@@ -46,26 +46,19 @@ def features(observation: Observation, scale_m: float) -> tuple[Tensor, Tensor, 
     if not isinstance(observation, dict):
         raise TypeError('a set network takes observation = "devices"')
     uav, devices = observation["uav"], observation["devices"]
-    offset, valid = devices[..., :2], devices[..., 5]
-    count = valid.sum(dim=1, keepdim=True)
-    age = devices[..., 2] * (REFERENCE_DEVICES / count)
-    log_age = torch.log1p(age) * valid
-    plain_age = age.clamp(max=20.0) / 5.0 * valid  # returns are sums of ages: linear where flights mostly are
-    oldest = (age * valid).amax(dim=1, keepdim=True)
-    share = age * valid / (oldest + 1e-3)
-    own = torch.stack([log_age, plain_age, share, devices[..., 3], devices[..., 4] / 2.0, valid], dim=-1)
-    tokens = torch.cat([_place(offset, scale_m), own], dim=-1)
-    globals_ = torch.cat(
-        [
-            uav[:, :2] / scale_m - 1.0,
-            torch.log1p(uav[:, 2:3]),
-            uav[:, 3:4],
-            torch.log1p(oldest),
-            log_age.sum(dim=1, keepdim=True) / count,
-            plain_age.sum(dim=1, keepdim=True) / count,
-        ],
-        dim=-1,
-    )
+    offset, known = devices[..., :2], devices[..., 5:]  # columns stay columns: an operation costs more than its numbers
+    count = known.sum(dim=1)
+    age = devices[..., 2:3] * (REFERENCE_DEVICES / count)[:, None]
+    plain_age = age.clamp(max=20.0) / 5.0  # returns are sums of ages: linear where flights mostly are
+    ages = torch.cat([torch.log1p(age), plain_age], dim=-1) * known
+    age = age * known
+    oldest = age.amax(dim=1)
+    share = age / (oldest + 1e-3)[:, None]
+    traffic = devices[..., 3:5] * torch.tensor([1.0, 0.5], device=devices.device)  # priority, and packets of 2 Mbit
+    tokens = torch.cat([_place(offset, scale_m), ages, share, traffic, known], dim=-1)
+    place, energy, left = uav[:, :2] / scale_m - 1.0, torch.log1p(uav[:, 2:3]), uav[:, 3:]
+    globals_ = torch.cat([place, energy, left, torch.log1p(oldest), ages.sum(dim=1) / count], dim=-1)
+    valid = known.squeeze(-1)
     return tokens, globals_, valid, offset
 
 
