@@ -277,14 +277,14 @@ def test_expectile_of_a_uniform_variable_is_the_known_one(expectile: float) -> N
 
 
 @BOTH
-@pytest.mark.parametrize(("beta", "limit"), [(3.0, 1e6), (2.0, 1.0)])
+@pytest.mark.parametrize(("beta", "limit"), [(1.0, 1e6), (2.0, 1.0)])
 def test_losses_of_iql(kind: Kind, beta: float, limit: float) -> None:
     settings: dict[str, Any] = {"discount": 0.8, "huber": None, "expectile": 0.8}
     made = iql(kind, **settings, inverse_temperature=beta, weight_limit=limit)
     rows = 16
     data = batch(kind, rows)
     with torch.no_grad():  # as many advantages above 0 as below
-        middle = (made.target_q(data) - made.state_value(data.observation)).median()
+        middle = (made.target_q(data) - made.state_value(data.observation)).quantile(0.5)  # between two of them
         last = made.value.rest.out if kind == "mlp" else made.value.out  # type: ignore[union-attr]  # a module
         last.bias.add_(middle)  # type: ignore[operator,union-attr]  # a tensor
     v_loss, q_loss, actor_loss, capped = 0.0, 0.0, 0.0, 0

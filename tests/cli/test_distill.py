@@ -55,7 +55,10 @@ def test_a_teacher_gets_a_student(runs: Path, tmp_path: Path, capsys: pytest.Cap
         (["nowhere"], "nowhere"),
         (["TEACHER", "--data", "WIDE"], "has shape (60, 10), allowed: (60, 8)"),
         (["TEACHER", "--set", "q_weight=-1"], "'q_weight' = -1"),
-        (["TEACHER", "--set", "teacher.network.width=9"], "network must be that of the teacher"),
+        (["TEACHER", "--set", "teacher.network.width=9"], "teacher.network is set, allowed: as '"),
+        (["TEACHER", "--set", "teacher.diffusion.steps=7"], "teacher.diffusion is set, allowed: as '"),
+        (["TEACHER", "--set", "network.scale_m=9"], "network must be that of the teacher, but for its width"),
+        (["TEACHER", "--set", "choice=student", "--set", "candidates=2"], "candidates = 2 needs choice = 'critic'"),
         (["TEACHER", "--updates", "0"], "'updates' = 0"),
     ],
 )

@@ -55,10 +55,14 @@ class Distill:
             raise ConfigError(f"'{self.checkpoint}' is of agent '{agent}', allowed: diffusion_sac")
         transitions, scenario = load_source(self.data, trained_scenario(place))
         shared = {name: getattr(teacher.config, name) for name in ("network", "reward", "batch_size")}
+        student = with_settings(OneStepConfig(teacher=teacher.config, **shared), self.set)
+        for part in ("network", "diffusion"):  # with another it would not be the trained one
+            if getattr(student.teacher, part) != getattr(teacher.config, part):
+                raise ConfigError(f"teacher.{part} is set, allowed: as '{self.checkpoint}' was trained")
         config = pydantic_config(
             TrainConfig,
             scenario=scenario,
-            agent=with_settings(OneStepConfig(teacher=teacher.config, **shared), self.set),
+            agent=student,
             updates=self.updates,
             seed=self.seed,
             log_every=min(LOG_EVERY, max(1, self.updates // 50)),
