@@ -121,22 +121,37 @@ class DiffusionActor(nn.Module):
             gradient_steps=gradient_steps,
         )
 
-    def map(self, denoiser: Denoiser, context: Context, start: Tensor) -> Tensor:
-        """x_0 (N, C + D) that the solver, by default DDIM over all steps, makes of x_M = start (N, C + D)."""
+    def map(self, denoiser: Denoiser, context: Context, start: Tensor | None) -> Tensor:
+        """x_0 (N, C + D) that the solver, by default DDIM over all steps, makes of x_M = start (N, C + D); None: 0."""
+        still = start is None
+        if start is None:
+            start = torch.zeros((), device=context[0].device)
         if self._steps_walked.device != start.device:
             self._walked, self._steps_walked = self._walked.to(start.device), self._steps_walked.to(start.device)
-        predict = self._chain(denoiser, context, start.device, self._steps_walked)
+        predict = self._chain(denoiser, context, start.device, self._steps_walked, still)
         if self._walk.name == "dpm":
             return dpm_solver_pp_2m(predict, self._walked, start, clip_x0=self.config.clip_x0)
         return ddim(predict, self._walked, start, None, clip_x0=self.config.clip_x0)
 
     def _chain(
-        self, denoiser: Denoiser, context: Context, device: torch.device, kept: Tensor | None = None
+        self,
+        denoiser: Denoiser,
+        context: Context,
+        device: torch.device,
+        kept: Tensor | None = None,
+        still: bool = False,
     ) -> ChainDenoiser:
-        """The network as the samplers call it, with the parts of s and of all steps computed here, once."""
+        """The network as the samplers call it, with the parts of s and of all steps computed here, once.
+
+        `still`: it sets out from 0.
+        """
         numbers = torch.arange(1, self.config.steps + 1, device=device) if kept is None else kept
         steps = denoiser.steps(numbers).split(1)
-        return lambda vector, step: denoiser.predict(context, vector, steps[step - 1])
+
+        def predict(vector: Tensor, step: int) -> Tensor:
+            return denoiser.predict(context, None if still and step == len(steps) else vector, steps[step - 1])
+
+        return predict
 
     @torch.no_grad()
     def act(self, context: Context, generator: torch.Generator, deterministic: bool) -> HybridAction:
@@ -153,9 +168,7 @@ class DiffusionActor(nn.Module):
         if noise is not None and self.solver is None:
             vector = self.sample(self.average, context, noise)
         else:
-            size = (context[0].shape[0], self.average.vector_size(context))
-            start = torch.zeros(size, device=context[0].device) if noise is None else noise.start
-            vector = self.map(self.average, context, start)
+            vector = self.map(self.average, context, None if noise is None else noise.start)
         return decode(self.average.possible(context, vector), self.continuous)
 
 

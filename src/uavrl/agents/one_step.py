@@ -89,9 +89,9 @@ class OneStep(Agent):
             network.load_state_dict(learned)
         self.teacher.critic.load_state_dict(teacher.critic.state_dict())
 
-    def map(self, student: Denoiser, context: Context, start: Tensor) -> Tensor:
-        """The student's vector (B, C + D) from x_M (B, C + D), in one pass."""
-        last = torch.full((1,), self.config.teacher.diffusion.steps, device=start.device)
+    def map(self, student: Denoiser, context: Context, start: Tensor | None) -> Tensor:
+        """The student's vector (B, C + D) from x_M (B, C + D), None being 0, in one pass."""
+        last = torch.full((1,), self.config.teacher.diffusion.steps, device=context[0].device)
         return student.predict(context, start, student.steps(last))
 
     def student_loss(self, batch: Batch, start: Tensor) -> tuple[Tensor, Metrics]:
@@ -136,8 +136,9 @@ class OneStep(Agent):
     def decide(self, observation: Observation, noise: Tensor | None) -> HybridAction:
         """See `Agent`."""
         context, count = self.average.encode(observation), 1 if noise is None else self.config.candidates
-        shape = (count * context[0].shape[0], self.average.vector_size(context))
-        start = torch.zeros(shape, device=context[0].device) if noise is None else noise.reshape(shape)
+        start = None
+        if noise is not None:
+            start = noise.reshape(count * context[0].shape[0], self.average.vector_size(context))
         context = repeat(context, count)
         vector = self.average.possible(context, self.map(self.average, context, start))
         answer = decode(vector, self.spaces.continuous)

@@ -30,14 +30,13 @@ REFERENCE_DEVICES = 10  # whose ages enter as they are: the K of the built-in da
 NEVER = -1e4  # logit and Q of a padded device
 
 
-def _place(offset_m: Tensor, scale_m: float) -> Tensor:
-    """Relative position and distance over `scale_m`, (..., 2) -> (..., 3)."""
-    scaled = offset_m / scale_m
-    return torch.cat([scaled, scaled.square().sum(dim=-1, keepdim=True).add(1e-8).sqrt()], dim=-1)
+def _distance(offset: Tensor) -> Tensor:
+    """Length of vectors (..., 2), (..., 1), whose slope at zero is zero."""
+    return offset.square().sum(dim=-1, keepdim=True).add(1e-8).sqrt()
 
 
 def features(observation: Observation, scale_m: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Tokens (B, K, 9), globals (B, 7), validity (B, K) and relative positions in metres (B, K, 2).
+    """Tokens (B, K, 9), globals (B, 7), validity (B, K) bool and relative positions in metres (B, K, 2).
 
     Ages enter as log(1 + age), as they are, and as a share of the oldest: absolute for the value, relative for whom to
     serve. They are scaled by `REFERENCE_DEVICES` / K first: of K devices served in turn each waits K services, so a
@@ -45,21 +44,20 @@ def features(observation: Observation, scale_m: float) -> tuple[Tensor, Tensor, 
     """
     if not isinstance(observation, dict):
         raise TypeError('a set network takes observation = "devices"')
-    uav, devices = observation["uav"], observation["devices"]
-    offset, known = devices[..., :2], devices[..., 5:]  # columns stay columns: an operation costs more than its numbers
-    count = known.sum(dim=1)
-    age = devices[..., 2:3] * (REFERENCE_DEVICES / count)[:, None]
+    # columns stay columns, and sums keep their axis: on board an operation costs more than its numbers
+    offset, age, traffic, known = observation["devices"].split([2, 1, 2, 1], dim=-1)
+    place, energy, left = observation["uav"].split([2, 1, 1], dim=-1)
+    count = known.sum(dim=1, keepdim=True)
+    age = age * (known * (REFERENCE_DEVICES / count))
     plain_age = age.clamp(max=20.0) / 5.0  # returns are sums of ages: linear where flights mostly are
-    ages = torch.cat([torch.log1p(age), plain_age], dim=-1) * known
-    age = age * known
-    oldest = age.amax(dim=1)
-    share = age / (oldest + 1e-3)[:, None]
-    traffic = devices[..., 3:5] * torch.tensor([1.0, 0.5], device=devices.device)  # priority, and packets of 2 Mbit
-    tokens = torch.cat([_place(offset, scale_m), ages, share, traffic, known], dim=-1)
-    place, energy, left = uav[:, :2] / scale_m - 1.0, torch.log1p(uav[:, 2:3]), uav[:, 3:]
-    globals_ = torch.cat([place, energy, left, torch.log1p(oldest), ages.sum(dim=1) / count], dim=-1)
-    valid = known.squeeze(-1)
-    return tokens, globals_, valid, offset
+    ages = torch.cat([torch.log1p(age), plain_age], dim=-1)
+    oldest = age.amax(dim=1, keepdim=True)
+    scaled = offset / scale_m
+    traffic = traffic * torch.tensor([1.0, 0.5], device=traffic.device)  # priority, and packets of 2 Mbit
+    tokens = torch.cat([scaled, _distance(scaled), ages, age / (oldest + 1e-3), traffic, known], dim=-1)
+    of_ages = torch.cat([torch.log1p(oldest), ages.sum(dim=1, keepdim=True) / count], dim=-1).squeeze(1)
+    globals_ = torch.cat([place / scale_m - 1.0, torch.log1p(energy), left, of_ages], dim=-1)
+    return tokens, globals_, known.squeeze(-1) > 0, offset
 
 
 class SetTrunk(nn.Module):
@@ -92,24 +90,35 @@ class SetTrunk(nn.Module):
         """The first layer's observation part."""
         return self.token(tokens), self.globals(globals_)
 
-    def forward(
-        self, token: Tensor, globals_: Tensor, valid: Tensor, token_extra: Tensor | None, global_extra: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        """Hidden vectors of tokens (B, K, width) and globals (B, width)."""
-        if self.global_extra is not None and global_extra is not None:
-            globals_ = globals_ + self.global_extra(global_extra)
-        if self.token_extra is not None and token_extra is not None:
-            flat = token_extra.reshape(-1, token_extra.shape[-1])
-            token = torch.addmm(token.reshape(-1, self.width), flat, self.token_extra.weight.T).view_as(token)
+    def join_tokens(self, token: Tensor, extra: Tensor) -> Tensor:
+        """Encoded tokens (B, K, width) with their extra inputs (B, K, .)."""
+        assert self.token_extra is not None  # noqa: S101  # for the type checker: who has extra inputs asked for them
+        flat = extra.reshape(-1, extra.shape[-1])
+        return torch.addmm(token.reshape(-1, self.width), flat, self.token_extra.weight.T).view_as(token)
+
+    def join_globals(self, globals_: Tensor, extra: Tensor, first: int = 0) -> Tensor:
+        """Encoded globals (B, width) with extra inputs (B, .), which are those from number `first` on."""
+        assert self.global_extra is not None  # noqa: S101  # as above
+        columns = self.global_extra.weight[:, first : first + extra.shape[-1]]
+        return torch.addmm(globals_, extra, columns.T)
+
+    def forward(self, token: Tensor, globals_: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+        """Hidden vectors of tokens (B, K, width) and globals (B, width), from both as encoded and joined."""
         hidden = functional.silu(token + self.global_to_token(globals_)[:, None])
         hidden = functional.silu(self.norms[0](self.token_hidden(hidden)))
-        mask = valid[:, None]
-        score = self.score(hidden).transpose(1, 2) + (mask - 1.0) * -NEVER
-        weight = torch.cat([mask / mask.sum(dim=2, keepdim=True), score.softmax(dim=2)], dim=1)
-        globals_ = functional.silu(self.norms[1](globals_ + self.pool((weight @ hidden).flatten(1))))
+        # equal scores make the mean
+        score = functional.linear(hidden, functional.pad(self.score.weight, (0, 0, 1, 0)))
+        weight = torch.where(valid[..., None], score, NEVER).softmax(dim=1)
+        globals_ = functional.silu(self.norms[1](globals_ + self.pool((weight.transpose(1, 2) @ hidden).flatten(1))))
         globals_ = functional.silu(self.norms[2](self.global_hidden(globals_)))
-        hidden = functional.silu(self.norms[3](self.token_out(hidden) + self.global_out(globals_)[:, None]))
+        bias = functional.linear(globals_, self.global_out.weight, self.token_out.bias)
+        hidden = functional.silu(self.norms[3](functional.linear(hidden, self.token_out.weight) + bias[:, None]))
         return hidden, globals_
+
+
+def _column(layer: nn.Linear, hidden: Tensor) -> Tensor:
+    """The one output of `layer` for hidden vectors (B, K, width), (B, K)."""
+    return hidden @ layer.weight[0] + layer.bias
 
 
 class _SetQ(nn.Module):
@@ -125,12 +134,14 @@ class _SetQ(nn.Module):
     def all_choices(self, context: Context, valid: Tensor, offset: Tensor, continuous: Tensor) -> Tensor:
         token, globals_ = context
         # the link that will carry the packet is the one after the move, which a disc of reach_m limits
-        length = continuous.square().sum(dim=1, keepdim=True).add(1e-8).sqrt()
-        move = self.reach_m * continuous / length.clamp(min=1.0)
-        after = _place(offset - move[:, None], self.scale_m)
+        length = _distance(continuous)
+        move = continuous / length.clamp(min=1.0)
+        after = (offset - self.reach_m * move[:, None]) / self.scale_m
+        token = self.trunk.join_tokens(token, torch.cat([after, _distance(after)], dim=-1))
         # a move takes time in proportion to its length, a cone that a smooth network cannot make from w alone
-        hidden, whole = self.trunk(token, globals_, valid, after, torch.cat([continuous, length], dim=1))
-        devices = torch.where(valid > 0, self.device_out(hidden).squeeze(-1), NEVER)
+        globals_ = self.trunk.join_globals(globals_, torch.cat([continuous, length], dim=1))
+        hidden, whole = self.trunk(token, globals_, valid)
+        devices = torch.where(valid, _column(self.device_out, hidden), NEVER)
         return torch.cat([self.idle_out(whole), devices], dim=-1)
 
 
@@ -190,16 +201,19 @@ class SetDenoiser(Denoiser):
         return (*self.trunk.encode(tokens, globals_), valid)
 
     def steps(self, step: Tensor) -> Tensor:
-        """Their embedding, (n, 16)."""
-        return step_embedding(step, self.embedding_size)
+        """The first layer's step part, (n, width)."""
+        embedded = step_embedding(step, self.embedding_size)
+        return self.trunk.join_globals(torch.zeros((), device=step.device), embedded, first=self.continuous + 1)
 
-    def predict(self, context: Context, vector: Tensor, step: Tensor) -> Tensor:
+    def predict(self, context: Context, vector: Tensor | None, step: Tensor) -> Tensor:
         """See `Denoiser`."""
         token, globals_, valid = context
-        own, rest = vector[:, self.continuous + 1 :, None], vector[:, : self.continuous + 1]
-        whole = torch.cat([rest, step.expand(rest.shape[0], -1)], dim=-1)
-        hidden, whole = self.trunk(token, globals_, valid, own, whole)
-        return torch.cat([self.global_out(whole), self.device_out(hidden).squeeze(-1)], dim=-1)
+        globals_ = globals_ + step
+        if vector is not None:
+            globals_ = self.trunk.join_globals(globals_, vector[:, : self.continuous + 1])
+            token = self.trunk.join_tokens(token, vector[:, self.continuous + 1 :, None])
+        hidden, whole = self.trunk(token, globals_, valid)
+        return torch.cat([self.global_out(whole), _column(self.device_out, hidden)], dim=-1)
 
     def vector_size(self, context: Context) -> int:
         """C + K + 1 for this observation's K."""
@@ -208,7 +222,7 @@ class SetDenoiser(Denoiser):
     def possible(self, context: Context, vector: Tensor) -> Tensor:
         """See `Denoiser`."""
         first = self.continuous + 1
-        return torch.cat([vector[:, :first], torch.where(context[2] > 0, vector[:, first:], NEVER)], dim=1)
+        return torch.cat([vector[:, :first], torch.where(context[2], vector[:, first:], NEVER)], dim=1)
 
 
 class SetActor(Actor):
@@ -224,9 +238,9 @@ class SetActor(Actor):
     def forward(self, observation: Observation) -> ActorOutput:
         """See `Actor`."""
         tokens, globals_, valid, _ = features(observation, self.scale_m)
-        hidden, whole = self.trunk(*self.trunk.encode(tokens, globals_), valid, None, None)
+        hidden, whole = self.trunk(*self.trunk.encode(tokens, globals_), valid)
         mean, log_std, idle = self.global_out(whole).split([self.continuous, self.continuous, 1], dim=-1)
-        devices = torch.where(valid > 0, self.device_out(hidden).squeeze(-1), NEVER)
+        devices = torch.where(valid, _column(self.device_out, hidden), NEVER)
         return ActorOutput(mean, bounded_log_std(log_std), torch.cat([idle, devices], dim=-1))
 
 
@@ -243,10 +257,10 @@ class SetChoiceActor(ChoiceActor):
     def forward(self, observation: Observation) -> ChoiceActorOutput:
         """See `ChoiceActor`."""
         tokens, globals_, valid, _ = features(observation, self.scale_m)
-        hidden, whole = self.trunk(*self.trunk.encode(tokens, globals_), valid, None, None)
+        hidden, whole = self.trunk(*self.trunk.encode(tokens, globals_), valid)
         raw = torch.cat([self.idle_out(whole)[:, None], self.device_out(hidden)], dim=1)
         mean, log_std, logits = choice_output(raw)
-        devices = torch.where(valid > 0, logits[:, 1:], NEVER)
+        devices = torch.where(valid, logits[:, 1:], NEVER)
         return ChoiceActorOutput(mean, log_std, torch.cat([logits[:, :1], devices], dim=1))
 
 
@@ -271,12 +285,15 @@ class SetConditional(Conditional):
         """See `Conditional`."""
         token, globals_, valid = context
         if choice is None:
-            hidden, whole = self.trunk(token, globals_, valid, None, inputs)
             weight = valid / valid.sum(dim=1, keepdim=True)
+            extra = inputs
         else:
             idle, weight = choice[:, :1], choice[:, 1:]
+            token = self.trunk.join_tokens(token, weight[:, :, None])
             extra = idle if inputs is None else torch.cat([inputs, idle], dim=1)
-            hidden, whole = self.trunk(token, globals_, valid, weight[:, :, None], extra)
+        if extra is not None:
+            globals_ = self.trunk.join_globals(globals_, extra)
+        hidden, whole = self.trunk(token, globals_, valid)
         own = (weight[:, None] @ hidden).squeeze(1)
         outputs: Tensor = self.out(torch.cat([whole, own], dim=1))
         return outputs

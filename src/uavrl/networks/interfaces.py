@@ -70,8 +70,11 @@ class Denoiser(nn.Module, ABC):
         """The part of denoising steps 1..M (n,), first axis n; a chain computes it once for all of its steps."""
 
     @abstractmethod
-    def predict(self, context: Context, vector: Tensor, step: Tensor) -> Tensor:
-        """Predicted noise (B, C + D) of a noisy diffusion vector (B, C + D) from B rows of `steps`, or 1 for all."""
+    def predict(self, context: Context, vector: Tensor | None, step: Tensor) -> Tensor:
+        """Predicted noise (B, C + D) of a noisy diffusion vector (B, C + D) from B rows of `steps`, or 1 for all.
+
+        None is the zero vector, from which a deterministic decision sets out: its part costs nothing.
+        """
 
     def forward(self, context: Context, vector: Tensor, step: Tensor) -> Tensor:
         """Predicted noise (B, C + D) of a noisy diffusion vector (B, C + D) at steps 1..M (B,)."""

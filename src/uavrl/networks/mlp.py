@@ -240,9 +240,11 @@ class MlpDenoiser(Denoiser):
         part: Tensor = self.step(step_embedding(step, self.embedding_size))
         return part
 
-    def predict(self, context: Context, vector: Tensor, step: Tensor) -> Tensor:
+    def predict(self, context: Context, vector: Tensor | None, step: Tensor) -> Tensor:
         """See `Denoiser`."""
-        first = torch.addmm(context[0] + step, vector, self.action.weight.T)
+        first: Tensor = context[0] + step
+        if vector is not None:
+            first = torch.addmm(first, vector, self.action.weight.T)
         noise: Tensor = self.rest(first)
         return noise
 
