@@ -3,6 +3,7 @@
     for s in 0 1 2 3 4; do
       uavrl train diffusion_sac --out RUNS/teacher-$s --set diffusion.steps=50 --updates 4000 --seed $s
       uavrl distill RUNS/teacher-$s --out RUNS/student-$s --seed $s
+      uavrl distill RUNS/teacher-$s --out RUNS/own-$s --set choice=student --seed $s
     done
     python -m benchmarks.steps fly RUNS OUT [SEED ...]    # the evaluation's 100 layouts x 3 fadings
     python -m benchmarks.steps time RUNS OUT              # exported policies of seed 0, on an otherwise idle machine
@@ -49,18 +50,21 @@ class Way(NamedTuple):
     """A way to decide."""
 
     name: str
-    run: str  # teacher or student
+    run: str  # teacher, student (the teacher's critic chooses the device) or own (it chooses itself)
     decision: Decision = Decision()
     deterministic: bool = True
 
 
 def _ways() -> Iterator[Way]:
+    yield Way("one-step student, own choice", "own")
     yield Way("one-step student", "student")
     yield Way("one-step student, best of 10 samples", "student", Decision(candidates=10), deterministic=False)
     for steps in (1, 2, 3, 5, 10, 50):
         yield Way(f"DDIM, {steps}", "teacher", Decision(solver="ddim", steps=steps))
     for steps in (3, 5, 10):  # with one step or two DPM-Solver++(2M) is DDIM
         yield Way(f"DPM-Solver++(2M), {steps}", "teacher", Decision(solver="dpm", steps=steps))
+    for steps in (1, 5, 50):  # no critic is asked
+        yield Way(f"DDIM, {steps}, own choice", "teacher", Decision(solver="ddim", steps=steps, greedy_choice=False))
     for steps in (1, 5):
         for candidates in (1, 10):
             decided = Decision(solver="ddim", steps=steps, candidates=candidates)
@@ -71,12 +75,13 @@ def _ways() -> Iterator[Way]:
 
 WAYS = {way.name: way for way in _ways()}
 TEACHER = "DDIM, 50"
-CHARGED = ("one-step student", "DDIM, 1", "DDIM, 5", TEACHER)
+CHARGED = ("one-step student, own choice", "DDIM, 5, own choice", "DDIM, 5", TEACHER)
 SLOWER = {"this machine": 1.0, "ten times slower": 10.0}  # of machines
 
 FAMILIES = {  # of the figure: colour, marker, line, where the note stands: over or under the interval
     "one-step student": ("#D55E00", "D", "", True),
     "DDIM": ("#0072B2", "o", "-", True),
+    "DDIM, own choice": ("#CC79A7", "v", "-", True),
     "DPM-Solver++(2M)": ("#009E73", "s", "-", False),
     "samples": ("#56B4E9", "^", "", True),
     "other algorithms": ("#000000", "X", "", False),
@@ -240,13 +245,20 @@ def _family(name: str) -> str:
         return "other algorithms"
     if name.startswith("one-step"):
         return "one-step student"
-    return "samples" if "sample" in name else name.partition(",")[0]
+    if "sample" in name:
+        return "samples"
+    return "DDIM, own choice" if name.endswith("own choice") else name.partition(",")[0]
 
 
 def _note(name: str) -> str:
     if name in ALGORITHMS:
         return name
-    return name.partition(", ")[2].replace(" (the paper's)", "").replace("best of 10 samples", "best of 10")
+    return (
+        name.partition(", ")[2]
+        .replace(" (the paper's)", "")
+        .replace("best of 10 samples", "best of 10")
+        .replace(", own choice", "")
+    )
 
 
 def main(task: str, *words: str) -> None:

@@ -263,7 +263,7 @@ def test_a_greedy_choice_is_the_critics_best_for_the_actors_displacement(kind: K
         assert not torch.equal(own.choice, best)
 
 
-@pytest.mark.parametrize("settings", [{}, {"greedy_choice": False}, {"candidates": 3}])
+@pytest.mark.parametrize("settings", [{}, {"greedy_choice": False, "candidates": 3}, {"candidates": 3}])
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_null_action_is_taken_where_the_critic_finds_it_better(kind: Kind, settings: dict[str, Any]) -> None:
     seen = observation(kind, 200)
@@ -283,6 +283,23 @@ def test_the_null_action_is_taken_where_the_critic_finds_it_better(kind: Kind, s
     assert (action.continuous[holds] == 0).all()
     assert torch.equal(action.choice[~holds], acted.choice[~holds])
     assert torch.equal(action.continuous[~holds], acted.continuous[~holds])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_actor_that_chooses_alone_asks_no_critic_and_holds_its_place_when_idle(kind: Kind) -> None:
+    seen = observation(kind, 200)
+    plain, held = (diffusion_sac(kind, greedy_choice=False, null_candidate=null) for null in (False, True))
+    for parameter in held.critic.parameters():
+        parameter.data.fill_(float("nan"))
+    for made in (plain, held):
+        disturb(made.actor.average, 8)
+    before, after = (made.act(seen, generator=generator(1)) for made in (plain, held))
+    idle = before.choice == 0
+    assert 0 < idle.sum() < 200
+    assert torch.equal(after.choice, before.choice)
+    assert (after.continuous[idle] == 0).all()
+    assert (before.continuous[idle] != 0).any()
+    assert torch.equal(after.continuous[~idle], before.continuous[~idle])
 
 
 def test_the_average_acts_not_the_network_in_training() -> None:

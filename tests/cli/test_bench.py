@@ -67,21 +67,23 @@ def test_decisions_are_measured_beside_their_products(
 
 
 def test_the_decisions_measured_are_of_students_and_of_five_and_fifty_steps() -> None:
-    found: dict[str, tuple[str, int]] = {}
+    found: dict[str, tuple[str, int, bool]] = {}
     for name, case in decide.CASES.items():
         config = decide.settings(case)
         assert isinstance(config, OneStepConfig if "one_step" in name else DiffusionSacConfig)
-        steps = 1 if isinstance(config, OneStepConfig) else config.diffusion.steps
-        found[name] = (config.network.kind, steps)
         if isinstance(config, OneStepConfig):
-            assert config.choice == ("student" if name.endswith("own_choice") else "critic")
+            found[name] = (config.network.kind, 1, config.choice == "critic")
+        else:
+            found[name] = (config.network.kind, config.diffusion.steps, config.greedy_choice)
     assert found == {
-        "one_step": ("mlp", 1),
-        "default_one_step": ("devices", 1),
-        "default_one_step_own_choice": ("devices", 1),
-        "five_step": ("mlp", 5),
-        "fifty_step": ("mlp", 50),
-        "default": ("devices", 5),
+        "one_step": ("devices", 1, False),
+        "five_step": ("devices", 5, False),
+        "fifty_step": ("devices", 50, False),
+        "one_step_critic": ("devices", 1, True),
+        "five_step_critic": ("devices", 5, True),
+        "paper_one_step": ("mlp", 1, False),
+        "paper_five_step": ("mlp", 5, False),
+        "paper_fifty_step": ("mlp", 50, False),
     }
 
 

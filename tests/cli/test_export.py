@@ -91,7 +91,7 @@ def test_a_decision_is_changed_wherever_a_policy_is_flown_or_exported(folder: Pa
         ("export run@candidates=0 --sampled", "field 'candidates' = '0'"),
         ("export run@steps=3", "steps needs a solver: ddim or dpm"),
         ("export run@solver=euler", "field 'solver' = 'euler'"),
-        ("export run@quick", "policy 'run@quick': 'quick', allowed: candidates=N, null_candidate=true|false, solver="),
+        ("export run@quick", "policy 'run@quick': 'quick', allowed: candidates=N, null_candidate=true|false, greedy_"),
         ("export run@kind=3", "'kind=3', allowed: candidates=N"),
         ("export run@solver=ddim,solver=dpm", "'solver=dpm', allowed: candidates=N"),
         ("export run --verify --episodes 0", "--episodes 0, allowed: 1 or more"),

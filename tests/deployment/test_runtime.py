@@ -57,6 +57,17 @@ def test_one_aircraft_and_many_are_answered_alike(policy: Policy) -> None:
         np.testing.assert_allclose(displacement_m, batch.displacement_m[row], atol=1e-4)
 
 
+def test_an_answer_stays_when_the_next_question_is_asked(policy: Policy) -> None:
+    """Of one aircraft, the model reads and writes the same arrays each time; of each number of devices its own."""
+    seen = [one_set(devices=devices, seed=seed) for seed in range(4) for devices in (2, 4, 3)]
+    answers = [policy.decide(one) for one in seen]
+    again = [policy.decide(one) for one in reversed(seen)][::-1]
+    for before, after in zip(answers, again, strict=True):
+        assert before.displacement_m.tobytes() == after.displacement_m.tobytes()
+        assert before.device == after.device
+    assert len({answer.displacement_m.tobytes() for answer in answers}) == len(seen)
+
+
 def test_a_missing_reading_has_no_say_and_is_never_chosen(policy: Policy) -> None:
     for seed in range(50):
         whole = one_set(devices=4, seed=seed)

@@ -281,6 +281,13 @@ def test_the_denoiser_knows_its_step() -> None:
     assert not torch.allclose(found[1], found[2], atol=1e-4)
 
 
+def test_from_the_zero_vector_a_denoiser_predicts_the_same_without_its_part() -> None:
+    made = SetDenoiser(2, width=16, scale_m=500.0)
+    disturb(made, 1)
+    context, step = made.encode(seen()), made.steps(torch.tensor([4]))
+    torch.testing.assert_close(made.predict(context, None, step), made.predict(context, torch.zeros(ROWS, 3 + K), step))
+
+
 def test_a_flat_observation_is_refused() -> None:
     with pytest.raises(TypeError, match="devices"):
         SetActor(2, width=8, scale_m=500.0)(torch.zeros(2, 5))

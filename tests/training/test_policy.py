@@ -72,6 +72,8 @@ def test_a_decision_is_changed_at_loading_where_the_agent_can(tmp_path: Path) ->
         load_policy(tmp_path / "sac", SCENARIO, Decision(solver="dpm", steps=6))
     held = load_policy(tmp_path / "sac", SCENARIO, Decision(null_candidate=True)).agent
     assert held.config.null_candidate  # type: ignore[attr-defined]  # of this agent
+    alone = load_policy(tmp_path / "sac", SCENARIO, Decision(greedy_choice=False)).agent
+    assert not alone.config.greedy_choice  # type: ignore[attr-defined]  # as above
     saved(tmp_path / "iql", "iql", "devices")
     with pytest.raises(ConfigError, match="candidates = 4, allowed for agents that re-rank; not for iql"):
         load_policy(tmp_path / "iql", SCENARIO, Decision(candidates=4))

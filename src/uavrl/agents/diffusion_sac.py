@@ -111,7 +111,8 @@ class DiffusionSacConfig(AgentConfig):
     null_candidate: bool = Field(
         False,
         description="beside them stands the null action, w = 0 with choice 0 (hold the place, serve nobody), which no "
-        "network hits: of a move's cost the first metre is as dear as the last. Not in the backup",
+        "network hits: of a move's cost the first metre is as dear as the last. Not in the backup. Where no critic is "
+        "asked (greedy_choice false, one candidate) it stands for the actor's idling",
     )
 
     @model_validator(mode="after")
@@ -130,6 +131,11 @@ class DiffusionSacConfig(AgentConfig):
                 "or that be null (constant noise)"
             )
         return self
+
+
+def held(action: HybridAction) -> HybridAction:
+    """Actions (N) that idle where they are: w = 0 for choice 0."""
+    return action._replace(continuous=action.continuous * (action.choice > 0)[:, None])
 
 
 class DiffusionSac(Agent):
@@ -317,8 +323,8 @@ class DiffusionSac(Agent):
     def best(self, observation: Observation, drawn: HybridAction, count: int) -> HybridAction:
         """Of each row's `count` drawn actions, one after another, that of largest min Q; its choice as configured."""
         config = self.config
-        if count == 1 and not config.greedy_choice and not config.null_candidate:
-            return drawn
+        if count == 1 and not config.greedy_choice:
+            return held(drawn) if config.null_candidate else drawn
         rows = drawn.choice.shape[0] // count
         w, choice = drawn.continuous.view(rows, count, -1), drawn.choice.view(rows, count)
         if config.null_candidate:  # in the same pass, last: where it is no better than another the other is taken

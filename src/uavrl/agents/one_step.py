@@ -21,7 +21,7 @@ from torch.nn import functional
 from uavrl.actions import HybridAction, decode
 from uavrl.agents.base import Agent, AgentConfig, Batch, Metrics, adam, minimise, move_towards
 from uavrl.agents.diffusion_actor import block_mean
-from uavrl.agents.diffusion_sac import DiffusionSac, DiffusionSacConfig
+from uavrl.agents.diffusion_sac import DiffusionSac, DiffusionSacConfig, held
 from uavrl.networks import Denoiser, Observation, Spaces, make_denoiser, repeat
 from uavrl.networks.interfaces import Context
 
@@ -144,9 +144,7 @@ class OneStep(Agent):
         answer = decode(vector, self.spaces.continuous)
         if self.config.choice == "critic":
             return self.teacher.best(observation, answer, count)
-        if self.config.teacher.null_candidate:  # idling was learned from the null action, whose w = 0 no network hits
-            return answer._replace(continuous=answer.continuous * (answer.choice > 0)[:, None])
-        return answer
+        return held(answer) if self.config.teacher.null_candidate else answer
 
     @torch.no_grad()
     def act(self, observation: Observation, *, generator: torch.Generator, deterministic: bool = False) -> HybridAction:

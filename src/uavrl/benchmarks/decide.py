@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from uavrl.agents.base import Agent
 from uavrl.agents.diffusion_sac import DiffusionSacConfig
 from uavrl.agents.one_step import OneStepConfig
-from uavrl.agents.registry import make_agent, preset
+from uavrl.agents.registry import changed, make_agent, preset
 from uavrl.benchmarks.timing import rate
 from uavrl.benchmarks.train import Products
 from uavrl.datasets import load_builtin
@@ -30,21 +30,23 @@ WARM_UP = 50
 
 
 class Case(NamedTuple):
-    """A preset of Diffusion-SAC with a chain of so many steps, or its one-step student (1)."""
+    """A preset of Diffusion-SAC with a chain of so many steps, or its one-step student (1), and who says the device."""
 
     preset: str
     steps: int
-    choice: Literal["critic", "student"] = "critic"  # of a student
+    choice: Literal["critic", "actor"] = "actor"
 
 
-# The paper's perceptron, 3 x 256, decides by its chain alone; the set network of the default also asks its critic.
+# The set network of the default, without and with its critic; and the paper's perceptron, 3 x 256.
 CASES = {
-    "one_step": Case("paper", 1),
-    "five_step": Case("paper", 5),
-    "fifty_step": Case("paper", 50),
-    "default_one_step": Case("default", 1),
-    "default_one_step_own_choice": Case("default", 1, "student"),
-    "default": Case("default", 5),
+    "one_step": Case("default", 1),
+    "five_step": Case("default", 5),
+    "fifty_step": Case("default", 50),
+    "one_step_critic": Case("default", 1, "critic"),
+    "five_step_critic": Case("default", 5, "critic"),
+    "paper_one_step": Case("paper", 1),
+    "paper_five_step": Case("paper", 5),
+    "paper_fifty_step": Case("paper", 50),
 }
 
 
@@ -52,10 +54,10 @@ def settings(case: Case) -> DiffusionSacConfig | OneStepConfig:
     """The preset with the case's number of steps, or a student of it."""
     config = preset("diffusion_sac", case.preset)
     if case.steps == 1:
-        student = {"teacher": config.model_dump(), "network": config.network, "choice": case.choice}
+        choice = "critic" if case.choice == "critic" else "student"
+        student = {"teacher": config.model_dump(), "network": config.network, "choice": choice}
         return OneStepConfig.model_validate(student)
-    chain = config.diffusion.model_copy(update={"steps": case.steps})  # type: ignore[union-attr]  # of Diffusion-SAC
-    return DiffusionSacConfig.model_validate({**config.model_dump(), "diffusion": chain.model_dump()})
+    return changed(config, {"diffusion": {"steps": case.steps}, "greedy_choice": case.choice == "critic"})  # type: ignore[return-value]  # of its own type
 
 
 def times_s(call: Callable[[int], Any], seconds: float) -> NDArray[np.float64]:

@@ -19,6 +19,8 @@ from uavrl.scenario import Scenario
 if TYPE_CHECKING:
     from uavrl.training.policy import Decision
 
+SETTINGS = ("candidates=N", "null_candidate=true|false", "greedy_choice=true|false", "solver=ddim|dpm", "steps=N")
+
 
 def resolve(spec: str, scenario: Scenario) -> Policy:
     """A heuristic by name, a checkpoint (see `checkpoint_and_decision`), an exported file, your module:Class.
@@ -48,8 +50,7 @@ def resolve(spec: str, scenario: Scenario) -> Policy:
         return _import(spec, scenario)
     raise ConfigError(
         f"policy '{spec}' does not exist, allowed: {', '.join(POLICIES)}, the directory of a checkpoint, "
-        "pretrained:NAME, either with @candidates=N,null_candidate=true|false,solver=ddim|dpm,steps=N, an .onnx file, "
-        "module:Class"
+        f"pretrained:NAME, either with @{','.join(SETTINGS)}, an .onnx file, module:Class"
     )
 
 
@@ -66,10 +67,7 @@ def checkpoint_and_decision(spec: str) -> tuple[Path, Decision]:
     for setting in settings.split(",") if settings else ():
         name, equals, value = setting.partition("=")
         if not equals or name not in Decision.model_fields or name in values:
-            raise ConfigError(
-                f"policy '{spec}': '{setting}', allowed: candidates=N, null_candidate=true|false, solver=ddim|dpm, "
-                "steps=N, each once"
-            )
+            raise ConfigError(f"policy '{spec}': '{setting}', allowed: {', '.join(SETTINGS)}, each once")
         values[name] = value
     try:
         return Path(place), pydantic_config(Decision, **values)

@@ -34,6 +34,10 @@ class Decision(BaseModel):
 
     candidates: int | None = Field(None, ge=1, description="actions drawn at a decision, for an agent that re-ranks")
     null_candidate: bool | None = Field(None, description="whether holding the place, serving nobody, is among them")
+    greedy_choice: bool | None = Field(
+        None,
+        description="whether the critic says whom to serve, or the actor itself: with one candidate no critic is asked",
+    )
     solver: SolverName | None = Field(None, description="ddim without noise, or dpm: DPM-Solver++(2M)")
     steps: int | None = Field(None, ge=1, description="of the solver, at most M; by default M")
 
@@ -50,12 +54,17 @@ class Decision(BaseModel):
             ConfigError: the agent has no such part, or a chain of fewer steps.
         """
         name = agent.config.name  # type: ignore[attr-defined]  # every agent's own config names it
-        for setting, able in (("candidates", "agents that re-rank"), ("null_candidate", "Diffusion-SAC")):
+        able = {
+            "candidates": "agents that re-rank",
+            "null_candidate": "Diffusion-SAC",
+            "greedy_choice": "Diffusion-SAC",
+        }
+        for setting in able:
             value = getattr(self, setting)
             if value is None:
                 continue
             if not hasattr(agent.config, setting):
-                raise ConfigError(f"{setting} = {value}, allowed for {able}; not for {name}")
+                raise ConfigError(f"{setting} = {value}, allowed for {able[setting]}; not for {name}")
             try:
                 agent.config = type(agent.config).model_validate(agent.config.model_dump() | {setting: value})
             except ValidationError as error:
