@@ -3,7 +3,6 @@
     for s in 0 1 2 3 4; do
       uavrl train diffusion_sac --out RUNS/teacher-$s --set diffusion.steps=50 --updates 4000 --seed $s
       uavrl distill RUNS/teacher-$s --out RUNS/student-$s --seed $s
-      uavrl distill RUNS/teacher-$s --out RUNS/own-$s --set choice=student --seed $s
     done
     python -m benchmarks.steps fly RUNS OUT [SEED ...]    # the evaluation's 100 layouts x 3 fadings
     python -m benchmarks.steps time RUNS OUT              # exported policies of seed 0, on an otherwise idle machine
@@ -50,15 +49,13 @@ class Way(NamedTuple):
     """A way to decide."""
 
     name: str
-    run: str  # teacher, student (the teacher's critic chooses the device) or own (it chooses itself)
+    run: str  # teacher or student
     decision: Decision = Decision()
     deterministic: bool = True
 
 
 def _ways() -> Iterator[Way]:
-    yield Way("one-step student, own choice", "own")
     yield Way("one-step student", "student")
-    yield Way("one-step student, best of 10 samples", "student", Decision(candidates=10), deterministic=False)
     for steps in (1, 2, 3, 5, 10, 50):
         yield Way(f"DDIM, {steps}", "teacher", Decision(solver="ddim", steps=steps))
     for steps in (3, 5, 10):  # with one step or two DPM-Solver++(2M) is DDIM
@@ -75,7 +72,7 @@ def _ways() -> Iterator[Way]:
 
 WAYS = {way.name: way for way in _ways()}
 TEACHER = "DDIM, 50"
-CHARGED = ("one-step student, own choice", "DDIM, 5, own choice", "DDIM, 5", TEACHER)
+CHARGED = ("one-step student", "DDIM, 5, own choice", "DDIM, 5", TEACHER)
 SLOWER = {"this machine": 1.0, "ten times slower": 10.0}  # of machines
 
 FAMILIES = {  # of the figure: colour, marker, line, where the note stands: over or under the interval

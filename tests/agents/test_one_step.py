@@ -19,7 +19,7 @@ BOTH = pytest.mark.parametrize("kind", KINDS)
 
 
 def student(kind: Kind, **changes: Any) -> OneStep:
-    made = agent("one_step", kind, **changes)
+    made = agent("one_step", kind, **{"choice": "critic"} | changes)
     assert isinstance(made, OneStep)
     disturb(made.teacher.actor.average, 1)
     disturb(made.student, 2)

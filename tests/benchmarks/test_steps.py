@@ -16,7 +16,6 @@ from uavrl.scenario import load_scenario
 SHORT = load_scenario("released", max_steps=6)
 WAYS = (
     "one-step student",
-    "one-step student, own choice",
     "DDIM, 5, own choice",
     "DDIM, 2",
     "DPM-Solver++(2M), 3",
@@ -34,7 +33,6 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(steps, "CHARGED", WAYS[:2])
     saved(tmp_path / "teacher-0", "diffusion_sac", "devices", SHORT)
     saved(tmp_path / "student-0", "one_step", "devices", SHORT)
-    saved(tmp_path / "own-0", "one_step", "devices", SHORT, choice="student")
     return tmp_path
 
 

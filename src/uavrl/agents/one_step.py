@@ -1,11 +1,12 @@
 r"""One-step policy: a student that answers at once what a trained Diffusion-SAC's chain arrives at.
 
 After flow Q-learning (Park, Li, Levine 2025, arXiv:2502.02538). The teacher's DDIM without noise is a map from x_M to
-the vector [w, z] before its argmax; the student \mu_\omega(s, x_M) learns that map in one pass, with the teacher's Q:
+its vector [w, z], and with its critic's device and null action to a decision (w_\theta, d_\theta). The student
+[w, z] = \mu_\omega(s, x_M) learns these decisions in one pass, with the teacher's Q where that has a weight:
+    L = E|w - w_\theta|^2 + E[-\log softmax(z)_{d_\theta}] + q_weight L_g(\mu_\omega(s, x_M))
+With choice = "critic" it learns the map alone, before the argmax, and asks the critic at each decision:
     L = E|\mu_\omega(s, x_M) - DDIM_\theta(s, x_M)|^2 + q_weight L_g(\mu_\omega(s, x_M))
-An ancestral chain is no map of x_M: a squared error to it would average its modes. With choice = "student" the
-teacher's decision takes the place of its vector, its critic's device and null action included:
-    L = E|w - w_\theta|^2 + E[-\log softmax(z)_{d_\theta}] + q_weight L_g,   (w_\theta, d_\theta) decided for x_M
+An ancestral chain is no map of x_M: a squared error to it would average its modes.
 """
 
 from __future__ import annotations
@@ -38,9 +39,9 @@ class OneStepConfig(AgentConfig):
     )
     displacement_weight: float = Field(3.0, gt=0, description="weight of a continuous entry in the squared error")
     choice: Literal["critic", "student"] = Field(
-        "critic",
-        description="whom to serve: the teacher's critic says it for the student's w; or the student itself, which "
-        "learns the teacher's decisions, null action included, and at a decision asks no critic",
+        "student",
+        description="whom to serve: the student itself says it, which learns the teacher's decisions, null action "
+        "included, and at a decision asks no critic; or the teacher's critic for the student's w",
     )
     student_average: float = Field(0.98, ge=0, lt=1, description="decay of the student that acts; 0: no average")
     candidates: int = Field(1, ge=1, description="actions drawn at a decision; the one of largest min Q is taken")
