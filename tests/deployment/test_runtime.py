@@ -6,6 +6,7 @@ import subprocess
 import sys
 import textwrap
 import venv
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +67,19 @@ def test_an_answer_stays_when_the_next_question_is_asked(policy: Policy) -> None
         assert before.displacement_m.tobytes() == after.displacement_m.tobytes()
         assert before.device == after.device
     assert len({answer.displacement_m.tobytes() for answer in answers}) == len(seen)
+
+
+def test_threads_that_share_a_policy_get_their_own_answers(policy: Policy) -> None:
+    seen = [one_set(seed=seed) for seed in range(4)]
+    alone = [policy.decide(one).displacement_m.tobytes() for one in seen]
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(len(seen)) as pool:
+            found = pool.map(lambda one: {policy.decide(one).displacement_m.tobytes() for _ in range(5_000)}, seen)
+            assert list(found) == [{answer} for answer in alone]
+    finally:
+        sys.setswitchinterval(before)
 
 
 def test_a_missing_reading_has_no_say_and_is_never_chosen(policy: Policy) -> None:

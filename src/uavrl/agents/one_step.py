@@ -3,7 +3,7 @@ r"""One-step policy: a student that answers at once what a trained Diffusion-SAC
 After flow Q-learning (Park, Li, Levine 2025, arXiv:2502.02538). The teacher's DDIM without noise is a map from x_M to
 its vector [w, z], and with its critic's device and null action to a decision (w_\theta, d_\theta). The student
 [w, z] = \mu_\omega(s, x_M) learns these decisions in one pass, with the teacher's Q where that has a weight:
-    L = E|w - w_\theta|^2 + E[-\log softmax(z)_{d_\theta}] + q_weight L_g(\mu_\omega(s, x_M))
+    L = displacement_weight E|w - w_\theta|^2 + E[-\log softmax(z)_{d_\theta}] + q_weight L_g(\mu_\omega(s, x_M))
 With choice = "critic" it learns the map alone, before the argmax, and asks the critic at each decision:
     L = E|\mu_\omega(s, x_M) - DDIM_\theta(s, x_M)|^2 + q_weight L_g(\mu_\omega(s, x_M))
 An ancestral chain is no map of x_M: a squared error to it would average its modes.
@@ -33,7 +33,7 @@ class OneStepConfig(AgentConfig):
     name: Literal["one_step"] = "one_step"
     teacher: DiffusionSacConfig = DiffusionSacConfig()
     learning_rate: float = Field(1e-3, gt=0, description="of Adam")
-    q_weight: float = Field(0.0, ge=0, description="of L_g beside the squared error; 0 skips it")
+    q_weight: float = Field(0.0, ge=0, description="of L_g beside the error; 0 skips it")
     still: float = Field(
         0.75, ge=0, le=1, description="share of a batch that starts from x_M = 0, as a deterministic decision does"
     )

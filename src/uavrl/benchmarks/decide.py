@@ -6,7 +6,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -34,7 +34,7 @@ class Case(NamedTuple):
 
     preset: str
     steps: int
-    choice: Literal["critic", "actor"] = "actor"
+    critic: bool = False
 
 
 # The set network of the default, without and with its critic; and the paper's perceptron, 3 x 256.
@@ -42,8 +42,8 @@ CASES = {
     "one_step": Case("default", 1),
     "five_step": Case("default", 5),
     "fifty_step": Case("default", 50),
-    "one_step_critic": Case("default", 1, "critic"),
-    "five_step_critic": Case("default", 5, "critic"),
+    "one_step_critic": Case("default", 1, critic=True),
+    "five_step_critic": Case("default", 5, critic=True),
     "paper_one_step": Case("paper", 1),
     "paper_five_step": Case("paper", 5),
     "paper_fifty_step": Case("paper", 50),
@@ -54,10 +54,10 @@ def settings(case: Case) -> DiffusionSacConfig | OneStepConfig:
     """The preset with the case's number of steps, or a student of it."""
     config = preset("diffusion_sac", case.preset)
     if case.steps == 1:
-        choice = "critic" if case.choice == "critic" else "student"
+        choice = "critic" if case.critic else "student"
         student = {"teacher": config.model_dump(), "network": config.network, "choice": choice}
         return OneStepConfig.model_validate(student)
-    return changed(config, {"diffusion": {"steps": case.steps}, "greedy_choice": case.choice == "critic"})  # type: ignore[return-value]  # of its own type
+    return changed(config, {"diffusion": {"steps": case.steps}, "greedy_choice": case.critic})  # type: ignore[return-value]  # of its own type
 
 
 def times_s(call: Callable[[int], Any], seconds: float) -> NDArray[np.float64]:

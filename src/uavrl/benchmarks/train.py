@@ -17,7 +17,8 @@ from uavrl.scenario import load_scenario
 from uavrl.training.offline import OfflineLearner, TrainConfig
 
 PRESETS = {"paper": "fixed", "default": "layouts"}  # preset -> built-in data it is timed on
-_PRODUCTS = {torch.ops.aten.mm.default, torch.ops.aten.addmm.default, torch.ops.aten.bmm.default}
+_ATEN = torch.ops.aten
+_PRODUCTS = {_ATEN.mm.default, _ATEN.addmm.default, _ATEN.bmm.default, _ATEN.mv.default}
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,8 @@ class Products(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Note a product's factors, and run it."""
         if func in _PRODUCTS:
-            self.found[Operand.of(args[-2]), Operand.of(args[-1])] += 1
+            first, second = args[-2:]
+            self.found[Operand.of(first), Operand.of(second[:, None] if second.dim() == 1 else second)] += 1
         return func(*args, **(kwargs or {}))
 
     @property

@@ -125,7 +125,7 @@ class BenchDecide:
         for name, case in decide.CASES.items():
             found |= decide.measure(name, self.seconds)
             what = "one-step student" if case.steps == 1 else f"{case.steps} steps"
-            what += ", the critic chooses the device" if case.choice == "critic" else ""
+            what += ", the critic chooses the device" if case.critic else ""
             print(
                 f"preset {case.preset}, {what}: {found[f'{name}_ms']:.3g} ms in the median, "
                 f"{found[f'{name}_p99_ms']:.3g} ms in the 99th percentile; its products take "

@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,10 +47,7 @@ class _Input:
         self.name, self.entries = name, facts["entries"]
         self.shape = tuple(facts["shape"])  # of one aircraft; None: any number
         self.low, self.high, self.cap = (np.array(facts[bound]) for bound in ("low", "high", "cap"))
-        self.low_heard = np.where(
-            [entry == "valid" for entry in self.entries], 1.0, self.low
-        )  # of a reading that is there
-        self._fitting: set[tuple[int, ...]] = set()  # shapes met before
+        self._fitting: set[tuple[int, ...]] = set()  # shapes of one aircraft met before
 
     def told(self, batch: bool) -> str:
         sizes = ["K" if size is None else str(size) for size in self.shape]
@@ -71,7 +69,8 @@ class _Input:
             raise PolicyError(
                 f"{self.name} has shape {array.shape}, needed: {self.told(False)}, or {self.told(True)} for B aircraft"
             )
-        self._fitting.add(array.shape)
+        if array.ndim == len(self.shape):  # of one aircraft, and few such shapes are met
+            self._fitting.add(array.shape)
         return array
 
     def checked(self, array: NDArray[np.float64]) -> Float32:
@@ -102,14 +101,15 @@ class _Single:
             each = [np.broadcast_to(getattr(one, bound), shape) for one, shape in zip(inputs, shapes, strict=True)]
             return np.concatenate([array.ravel() for array in each])
 
-        self._low, self._high, self._cap = flat("low_heard"), flat("high"), flat("cap")
-        self._given = np.empty(len(self._low))
-        self._fits, self._below = np.empty((2, len(self._low)), dtype=np.bool_)
-        self._taken = np.empty(len(self._low), dtype=np.float32)
+        self._low, self._high, self._cap = flat("low"), flat("high"), flat("cap")
         ends = np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1]
+        for one, low in zip(inputs, np.split(self._low, ends), strict=True):
+            if one.entries[-1] == "valid":
+                low[len(one.entries) - 1 :: len(one.entries)] = 1.0  # a reading that is missing is not for here
+        self._given, self._taken = np.empty(len(self._low)), np.empty(len(self._low), dtype=np.float32)
         self._parts = [part.reshape(shape) for part, shape in zip(np.split(self._given, ends), shapes, strict=True)]
         self._displacement_m, self._device = np.empty((1, 2), dtype=np.float32), np.empty(1, dtype=np.int64)
-        self._session, self._binding = session, session.io_binding()
+        self._session, self._binding, self._lock = session, session.io_binding(), Lock()
         for one, part, shape in zip(inputs, np.split(self._taken, ends), shapes, strict=True):
             self._binding.bind_ortvalue_input(one.name, _shared(part.reshape(1, *shape)))
         self._binding.bind_ortvalue_output("displacement_m", _shared(self._displacement_m))
@@ -117,16 +117,14 @@ class _Single:
 
     def decide(self, arrays: Sequence[NDArray[np.float64]]) -> Decision | None:
         """None where something is out of its bounds, or a device has no reading."""
-        for part, array in zip(self._parts, arrays, strict=True):
-            part[...] = array
-        np.greater_equal(self._given, self._low, out=self._fits)
-        np.less_equal(self._given, self._high, out=self._below)
-        np.logical_and(self._fits, self._below, out=self._fits)
-        if not self._fits.all():
-            return None
-        np.minimum(self._given, self._cap, out=self._taken, casting="same_kind")
-        self._session.run_with_iobinding(self._binding)
-        return Decision(self._displacement_m[0].copy(), int(self._device[0]))
+        with self._lock:
+            for part, array in zip(self._parts, arrays, strict=True):
+                part[...] = array
+            if not ((self._given >= self._low) & (self._given <= self._high)).all():
+                return None
+            np.minimum(self._given, self._cap, out=self._taken, casting="same_kind")
+            self._session.run_with_iobinding(self._binding)
+            return Decision(self._displacement_m[0].copy(), int(self._device[0]))
 
 
 def _shared(array: NDArray[Any]) -> onnxruntime.OrtValue:
@@ -134,7 +132,7 @@ def _shared(array: NDArray[Any]) -> onnxruntime.OrtValue:
 
 
 class Policy:
-    """A policy written by `uavrl export`. It is for one thread; for several, load it several times.
+    """A policy written by `uavrl export`.
 
     Args:
         path: the file.

@@ -96,11 +96,10 @@ class SetTrunk(nn.Module):
         flat = extra.reshape(-1, extra.shape[-1])
         return torch.addmm(token.reshape(-1, self.width), flat, self.token_extra.weight.T).view_as(token)
 
-    def join_globals(self, globals_: Tensor, extra: Tensor, first: int = 0) -> Tensor:
-        """Encoded globals (B, width) with extra inputs (B, .), which are those from number `first` on."""
+    def join_globals(self, globals_: Tensor, extra: Tensor, part: slice = slice(None)) -> Tensor:
+        """Encoded globals (B, width) with their extra inputs (B, .), or a `part` of these."""
         assert self.global_extra is not None  # noqa: S101  # as above
-        columns = self.global_extra.weight[:, first : first + extra.shape[-1]]
-        return torch.addmm(globals_, extra, columns.T)
+        return torch.addmm(globals_, extra, self.global_extra.weight[:, part].T)
 
     def forward(self, token: Tensor, globals_: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """Hidden vectors of tokens (B, K, width) and globals (B, width), from both as encoded and joined."""
@@ -202,15 +201,18 @@ class SetDenoiser(Denoiser):
 
     def steps(self, step: Tensor) -> Tensor:
         """The first layer's step part, (n, width)."""
-        embedded = step_embedding(step, self.embedding_size)
-        return self.trunk.join_globals(torch.zeros((), device=step.device), embedded, first=self.continuous + 1)
+        none = torch.zeros((), device=step.device)
+        return self.trunk.join_globals(
+            none, step_embedding(step, self.embedding_size), slice(self.continuous + 1, None)
+        )
 
     def predict(self, context: Context, vector: Tensor | None, step: Tensor) -> Tensor:
         """See `Denoiser`."""
         token, globals_, valid = context
         globals_ = globals_ + step
         if vector is not None:
-            globals_ = self.trunk.join_globals(globals_, vector[:, : self.continuous + 1])
+            rest = slice(self.continuous + 1)
+            globals_ = self.trunk.join_globals(globals_, vector[:, rest], rest)
             token = self.trunk.join_tokens(token, vector[:, self.continuous + 1 :, None])
         hidden, whole = self.trunk(token, globals_, valid)
         return torch.cat([self.global_out(whole), _column(self.device_out, hidden)], dim=-1)

@@ -33,7 +33,10 @@ class Decision(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     candidates: int | None = Field(None, ge=1, description="actions drawn at a decision, for an agent that re-ranks")
-    null_candidate: bool | None = Field(None, description="whether holding the place, serving nobody, is among them")
+    null_candidate: bool | None = Field(
+        None,
+        description="whether holding the place, serving nobody, is among them, or what idling is without a critic",
+    )
     greedy_choice: bool | None = Field(
         None,
         description="whether the critic says whom to serve, or the actor itself: with one candidate no critic is asked",
@@ -54,17 +57,16 @@ class Decision(BaseModel):
             ConfigError: the agent has no such part, or a chain of fewer steps.
         """
         name = agent.config.name  # type: ignore[attr-defined]  # every agent's own config names it
-        able = {
-            "candidates": "agents that re-rank",
-            "null_candidate": "Diffusion-SAC",
-            "greedy_choice": "Diffusion-SAC",
-        }
-        for setting in able:
+        for setting, able in (
+            ("candidates", "agents that re-rank"),
+            ("null_candidate", "Diffusion-SAC"),
+            ("greedy_choice", "Diffusion-SAC"),
+        ):
             value = getattr(self, setting)
             if value is None:
                 continue
             if not hasattr(agent.config, setting):
-                raise ConfigError(f"{setting} = {value}, allowed for {able[setting]}; not for {name}")
+                raise ConfigError(f"{setting} = {value}, allowed for {able}; not for {name}")
             try:
                 agent.config = type(agent.config).model_validate(agent.config.model_dump() | {setting: value})
             except ValidationError as error:
