@@ -124,10 +124,12 @@ def test_parity_of_candidates_that_are_re_ranked(tmp_path: Path) -> None:
     agree(expected, Policy(tmp_path / "policy.onnx").decide(arrays(seen), drawn.numpy()))
 
 
-def test_parity_of_the_null_action(tmp_path: Path) -> None:
-    made = agent("diffusion_sac", "devices", null_candidate=True)
+@pytest.mark.parametrize("greedy", [True, False])
+def test_parity_of_the_null_action(greedy: bool, tmp_path: Path) -> None:
+    made = agent("diffusion_sac", "devices", null_candidate=True, greedy_choice=greedy)
     assert isinstance(made, DiffusionSac)
     disturb(made.critic, 2, 0.1)
+    disturb(made.actor.average, 7, 0.2)
     export(made, RELEASED, tmp_path / "policy.onnx")
     seen = observation("devices", 500)
     expected = made.act(seen, generator=torch.Generator(), deterministic=True)
