@@ -19,8 +19,8 @@ class Export:
     """Write a trained policy as one ONNX file, which flies with numpy and onnxruntime alone."""
 
     checkpoint: tyro.conf.Positional[str]
-    """directory of a run or of a checkpoint, or pretrained:NAME; @candidates=N,solver=ddim|dpm,steps=N behind it
-    changes how it decides"""
+    """directory of a run or of a checkpoint, or pretrained:NAME; behind it
+    @candidates=N,greedy_choice=false,solver=ddim|dpm,steps=N changes how it decides"""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("policy.onnx")
     """the file"""
     sampled: bool = False
