@@ -134,7 +134,7 @@ class DiffusionSacConfig(AgentConfig):
 
 
 def held(action: HybridAction) -> HybridAction:
-    """Actions (N) that idle where they are: w = 0 for choice 0."""
+    """Actions (N) with w = 0, which no network hits, where the choice is 0: who idles holds its place."""
     return action._replace(continuous=action.continuous * (action.choice > 0)[:, None])
 
 
