@@ -200,6 +200,35 @@ def test_a_run_is_not_overwritten_and_goes_on_only_with_its_own_settings(
     assert "other data" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("at_once", [False, True])
+def test_several_seeds_are_as_many_runs(
+    folder: Path, at_once: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("uavrl.cli.train.at_once", lambda config, device: at_once)
+    words = ["diffusion_sac", "--data", "log.parquet", "--updates", "2", *SMALL]
+    assert train(*words, "--out", "runs", "--seed", "5", "--seeds", "2") == 0
+    out = capsys.readouterr().out.splitlines()
+    assert [line.partition(":")[0] for line in out] == [
+        "seed5",
+        "seed6",
+        "2 updates on 60 transitions; policy in runs/seed5, runs/seed6",
+        "next",
+    ]
+    assert "--policy tdm --policy runs/seed5 --policy runs/seed6 --scenario" in out[-1]
+    assert train(*words, "--out", "alone", "--seed", "6") == 0
+    alone, run = (load_checkpoint(folder / name / "checkpoint") for name in ("alone", "runs/seed6"))
+    assert run.document["train"] == alone.document["train"]
+    for name, value in run.tensors["networks"].items():
+        assert value.numpy() == pytest.approx(alone.tensors["networks"][name].numpy(), abs=1e-4), name
+    capsys.readouterr()
+    assert train(*words, "--out", "runs", "--seed", "4", "--seeds", "2") == 2
+    assert "--out 'runs/seed5' holds a run already; give --resume" in capsys.readouterr().err
+    assert not (folder / "runs/seed4").exists()
+    if not at_once:  # one by one: what is there is kept, what is not is begun
+        assert train(*words, "--out", "runs", "--seed", "4", "--seeds", "3", "--resume") == 0
+        assert load_checkpoint(folder / "runs/seed4/checkpoint").document["step"] == 2
+
+
 def test_a_part_of_a_file_and_the_papers_settings(folder: Path) -> None:
     words = ["diffusion_sac", "--out", "run", "--data", "log.parquet", "--size", "30", "--preset", "paper"]
     assert train(*words, "--updates", "1", *SMALL) == 0
@@ -222,6 +251,8 @@ def test_a_part_of_a_file_and_the_papers_settings(folder: Path) -> None:
         (["bc", "--out", "o", "--updates", "many"], ["--updates", "many"]),
         (["bc", "--out", "o", "--seed", "1000000"], ["seed", "1000000", "less than 1000000"]),
         (["bc", "--out", "o", "--seed", "-1"], ["seed", "-1"]),
+        (["bc", "--out", "o", "--seeds", "0"], ["--seeds 0", "at least 1"]),
+        (["bc", "--out", "o", "--seed", "999999", "--seeds", "2"], ["seed", "1000000", "less than 1000000"]),
         (["bc", "--out", "o", "--size", "61"], ["size = 61", "1 to 60"]),
         (["bc", "--out", "o", "--size", "9", "--data-seed", "-1"], ["seed = -1"]),
         (["bc", "--out", "o", "--quality", "good"], ["--quality good needs --size"]),

@@ -190,6 +190,39 @@ def test_layers_have_the_gradient_of_what_they_compute(activation: ActivationNam
     assert torch.autograd.gradcheck(run, (first, *parameters))
 
 
+def test_stacked_layers_are_layers_under_vmap() -> None:
+    torch.manual_seed(0)
+    several = [Layers(5, 3, 4, "mish", layer_norm=False) for _ in range(3)]
+    first, shared = torch.randn(3, 6, 5, requires_grad=True), torch.randn(6, 5)
+    weights = {
+        name: torch.stack([dict(one.named_parameters())[name].detach() for one in several]).requires_grad_()
+        for name, _ in several[0].named_parameters()
+    }
+
+    def run(values: dict[str, torch.Tensor], first: torch.Tensor) -> torch.Tensor:
+        out: torch.Tensor = functional_call(several[0], values, (first,))
+        return out
+
+    for inputs, dims in ((first, 0), (shared, None), (first.detach().movedim(0, 1).contiguous(), 1)):
+        out = torch.vmap(run, in_dims=(0, dims))(weights, inputs)
+        out.square().sum().backward()
+        for row, one in enumerate(several):
+            alone = one(inputs if dims is None else inputs.select(dims, row))
+            torch.testing.assert_close(out[row], alone)
+            for name, gradient in zip(
+                weights, torch.autograd.grad(alone.square().sum(), list(one.parameters())), strict=True
+            ):
+                found = weights[name].grad
+                assert found is not None
+                torch.testing.assert_close(found[row], gradient)
+        for value in weights.values():
+            value.grad = None
+    out = torch.vmap(run)(weights, first)
+    (through,) = torch.autograd.grad(out.square().sum(), first)
+    assert through.shape == first.shape
+    assert through.abs().sum() > 0
+
+
 def test_layers_are_linear_layers_with_activations_between() -> None:
     torch.manual_seed(0)
     made, first = Layers(5, 2, 4, "mish", layer_norm=True), torch.randn(6, 5)

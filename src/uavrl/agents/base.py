@@ -39,6 +39,10 @@ class Batch:
         """Rows by their numbers (M,), as often as they are named."""
         return self._each(lambda values: values.index_select(0, rows))
 
+    def grouped(self, groups: int) -> Batch:
+        """Its rows as (groups, B / groups, ...), one group after another."""
+        return self._each(lambda values: values.unflatten(0, (groups, -1)))
+
     def to(self, device: torch.device) -> Batch:
         """Itself where it is there already, else a copy."""
         return self._each(lambda values: values.to(device))
@@ -154,7 +158,7 @@ def minimise(
     parameters = list(network.parameters()) if isinstance(network, nn.Module) else network
     gradients = torch.autograd.grad(loss, parameters)
     for parameter, gradient in zip(parameters, gradients, strict=True):
-        parameter.grad = gradient
+        parameter.grad = gradient.contiguous()  # as its weights lie: fused Adam pairs entries by their place in memory
     norm = torch.nn.utils.clip_grad_norm_(parameters, clip if clip is not None else float("inf"))
     optimiser.step()
     return norm
@@ -163,11 +167,14 @@ def minimise(
 @contextmanager
 def frozen(network: nn.Module) -> Iterator[None]:
     """Inside, what `network` computes has gradients for its inputs alone; those for its weights cost as much again."""
-    network.requires_grad_(False)
+    trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
+    for parameter in trained:
+        parameter.requires_grad_(False)
     try:
         yield
     finally:
-        network.requires_grad_(True)
+        for parameter in trained:
+            parameter.requires_grad_(True)
 
 
 @torch.no_grad()

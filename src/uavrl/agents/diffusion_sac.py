@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from copy import deepcopy
 from types import MappingProxyType
-from typing import Literal, Self
+from typing import Literal, NamedTuple, Self
 
 import torch
 from pydantic import Field, model_validator
@@ -136,6 +136,23 @@ class DiffusionSacConfig(AgentConfig):
 def held(action: HybridAction) -> HybridAction:
     """Actions (N) with w = 0, which no network hits, where the choice is 0: who idles holds its place."""
     return action._replace(continuous=action.continuous * (action.choice > 0)[:, None])
+
+
+class CriticNoise(NamedTuple):
+    """What `DiffusionSac.critic_loss` takes beside its batch."""
+
+    chain: ChainNoise
+    uniform: Tensor | None = None
+    jitter: Tensor | None = None
+
+
+class ActorNoise(NamedTuple):
+    """What `DiffusionSac.actor_loss` takes beside its batch."""
+
+    step: Tensor
+    noise: Tensor
+    chain: ChainNoise | None = None
+    jitter: Tensor | None = None
 
 
 class DiffusionSac(Agent):
@@ -265,31 +282,32 @@ class DiffusionSac(Agent):
         metrics = {"guided_q": q.detach().mean(), "choice_confidence": probability.detach().amax(dim=-1).mean()}
         return -q.mean() / scale, metrics
 
-    def update(self, batch: Batch, generator: torch.Generator) -> Metrics:
-        """Critic, actor, target critic, target actor; what has no weight is not computed."""
-        config, device, count = self.config, generator.device, len(batch.reward)
+    def draw(self, count: int, generator: torch.Generator) -> tuple[CriticNoise, ActorNoise]:
+        """All randomness of an update on `count` transitions; what has no weight is not drawn."""
+        config, device = self.config, generator.device
         continuous, steps = self.spaces.continuous, config.diffusion.steps
         size = continuous + self.spaces.choices
         chain = ChainNoise.draw(count, size, steps, generator)
-        uniform = None
+        uniform, of_critic, of_actor = None, None, None
         if config.cql_weight > 0 and config.cql_samples > 0:
             shape = (count * config.cql_samples, continuous)
             uniform = 2.0 * torch.rand(shape, generator=generator, device=device) - 1.0
-        jitter: tuple[Tensor, Tensor] | tuple[None, None] = (None, None)
         if config.action_noise > 0:
-            first, second = torch.randn((2, count, continuous), generator=generator, device=device)
-            jitter = (first, second)
-        loss, metrics = self.critic_loss(batch, chain, uniform, jitter[0])
-        clip = config.gradient_clip
-        metrics["critic_gradient"] = minimise(loss, self.critic, self.optimisers["critic"], clip)
-
+            of_critic, of_actor = torch.randn((2, count, continuous), generator=generator, device=device)
         step = torch.randint(1, steps + 1, (count,), generator=generator, device=device)
         noise = torch.randn((count, size), generator=generator, device=device)
         guided = config.bc_weight < 1 and config.gradient != "one_step"
-        chain_for_actor = ChainNoise.draw(count, size, steps, generator) if guided else None
-        loss, more = self.actor_loss(batch, step, noise, chain_for_actor, jitter[1])
-        metrics["actor_gradient"] = minimise(loss, self.actor.denoiser, self.optimisers["actor"], clip)
+        guided_chain = ChainNoise.draw(count, size, steps, generator) if guided else None
+        return CriticNoise(chain, uniform, of_critic), ActorNoise(step, noise, guided_chain, of_actor)
 
+    def update(self, batch: Batch, generator: torch.Generator) -> Metrics:
+        """Critic, actor, target critic, target actor; what has no weight is not computed."""
+        config, clip = self.config, self.config.gradient_clip
+        of_critic, of_actor = self.draw(len(batch), generator)
+        loss, metrics = self.critic_loss(batch, *of_critic)
+        metrics["critic_gradient"] = minimise(loss, self.critic, self.optimisers["critic"], clip)
+        loss, more = self.actor_loss(batch, *of_actor)
+        metrics["actor_gradient"] = minimise(loss, self.actor.denoiser, self.optimisers["actor"], clip)
         move_towards(self.target, self.critic, config.polyak)
         move_towards(self.actor.average, self.actor.denoiser, 1.0 - config.actor_average)
         return metrics | more

@@ -18,7 +18,7 @@ from uavrl.scenario import Scenario
 
 if TYPE_CHECKING:
     from uavrl.datasets import Transitions
-    from uavrl.training.offline import Evaluator
+    from uavrl.training.offline import Evaluator, OfflineLearner, TrainConfig
 
 Many = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
@@ -51,6 +51,9 @@ class Train:
     """gradient steps; by default what the preset says"""
     seed: int = 0
     """of weights, data order and noise"""
+    seeds: int = 1
+    """training seeds, from --seed on, each in a directory of its own, OUT/seed0, OUT/seed1, ...: one after another, or
+    on a GPU all at once (diffusion_sac)"""
     set: Many = ()
     """a setting as name=value, such as bc_weight=0.3 or diffusion.steps=10; repeat it for more"""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -67,11 +70,11 @@ class Train:
     def run(self) -> None:
         from uavrl.agents.registry import preset
         from uavrl.datasets import builtin_names, load_source, select
-        from uavrl.training.checkpoint import recover
         from uavrl.training.health import summary
         from uavrl.training.log import progress, read_metrics, require_tensorboard
         from uavrl.training.objective import for_objective
-        from uavrl.training.offline import PRESET_UPDATES, OfflineLearner, TrainConfig
+        from uavrl.training.offline import PRESET_UPDATES, TrainConfig
+        from uavrl.training.stacked import StackedLearner
 
         if self.tensorboard:
             require_tensorboard()  # before anything that takes long
@@ -96,29 +99,71 @@ class Train:
             compilation=self.compile,
         )
         output_directory(self.out)
-        learner = OfflineLearner.resume(self.out, transitions, self.device) if self.resume else None
-        if self.resume and learner is None:
-            raise ConfigError(f"--resume: '{self.out}' holds no checkpoint")
-        if learner is None:
-            if recover(self.out / "checkpoint") is not None:
-                raise ConfigError(f"--out '{self.out}' holds a run already; give --resume or another directory")
-            learner = OfflineLearner(config, transitions, self.device)
-        elif learner.config != config:
-            began = ", ".join(_differing(learner.config.model_dump(), config.model_dump()))
-            raise ConfigError(f"--resume: '{self.out}' was started with other settings, give the same ones: {began}")
-        else:
-            print(f"going on from update {learner.updates:,}", file=sys.stderr)
+        places = self._places(config)
         trial = trial_flights(transitions, scenario) if self.evaluate_every else None
-        try:
-            with progress(f"train {self.agent}", config.updates, "update") as report:
-                learner.run(self.out, report, trial, tensorboard=self.tensorboard)
-        except KeyboardInterrupt:
-            if learner.saved is not None:
-                print(f"saved update {learner.saved:,}; the same command with --resume goes on", file=sys.stderr)
-            raise
-        print(summary(read_metrics(self.out / "metrics.jsonl"), learner.expected))
-        print(f"{learner.updates:,} updates on {len(transitions):,} transitions; policy in {self.out}")
-        print(f"next: uavrl evaluate --policy tdm --policy {self.out} --scenario {scenario.name}")
+        every = [list(places)] if at_once(config, self.device) else [[directory] for directory in places]
+        for directories in every:
+            learners = [self._learner(directory, places[directory], transitions) for directory in directories]
+            title = f"train {self.agent}" + (f" {directories[0].name}" if self.seeds > len(learners) else "")
+            try:
+                with progress(title, config.updates, "update") as report:
+                    if len(learners) > 1:
+                        StackedLearner(learners).run(directories, report, trial, tensorboard=self.tensorboard)
+                    else:
+                        learners[0].run(directories[0], report, trial, tensorboard=self.tensorboard)
+            except KeyboardInterrupt:
+                if learners[0].saved is not None:
+                    print(
+                        f"saved update {learners[0].saved:,}; the same command with --resume goes on", file=sys.stderr
+                    )
+                raise
+            for directory, learner in zip(directories, learners, strict=True):
+                of = f"{directory.name}: " if self.seeds > 1 else ""
+                print(of + summary(read_metrics(directory / "metrics.jsonl"), learner.expected))
+        print(f"{updates:,} updates on {len(transitions):,} transitions; policy in {', '.join(map(str, places))}")
+        judged = " ".join(f"--policy {directory}" for directory in places)
+        print(f"next: uavrl evaluate --policy tdm {judged} --scenario {scenario.name}")
+
+    def _places(self, config: TrainConfig) -> dict[Path, TrainConfig]:
+        """Each run's directory, free to begin in or, with --resume, begun."""
+        from uavrl.training.checkpoint import recover
+        from uavrl.training.offline import TrainConfig
+
+        if self.seeds < 1:
+            raise ConfigError(f"--seeds {self.seeds}, allowed: at least 1")
+        places = {self.out: config}
+        if self.seeds > 1:
+            seeds = range(self.seed, self.seed + self.seeds)
+            places = {
+                self.out / f"seed{seed}": pydantic_config(TrainConfig, **dict(config) | {"seed": seed})
+                for seed in seeds
+            }
+        begun = [directory for directory in places if recover(directory / "checkpoint") is not None]
+        if self.resume and not begun:
+            raise ConfigError(f"--resume: '{self.out}' holds no checkpoint")
+        if begun and not self.resume:
+            raise ConfigError(f"--out '{begun[0]}' holds a run already; give --resume or another directory")
+        return places
+
+    def _learner(self, directory: Path, config: TrainConfig, transitions: Transitions) -> OfflineLearner:
+        """Of one run, going on from its checkpoint with --resume."""
+        from uavrl.training.offline import OfflineLearner
+
+        learner = OfflineLearner.resume(directory, transitions, self.device) if self.resume else None
+        if learner is None:
+            return OfflineLearner(config, transitions, self.device)
+        if learner.config != config:
+            began = ", ".join(_differing(learner.config.model_dump(), config.model_dump()))
+            raise ConfigError(f"--resume: '{directory}' was started with other settings, give the same ones: {began}")
+        print(f"going on from update {learner.updates:,}", file=sys.stderr)
+        return learner
+
+
+def at_once(config: TrainConfig, device: str) -> bool:
+    """Whether training seeds learn in one stack: where a GPU would idle beside a single one."""
+    from uavrl.agents.diffusion_sac import DiffusionSacConfig
+
+    return device == "cuda" and config.compilation == "none" and isinstance(config.agent, DiffusionSacConfig)
 
 
 def _differing(began: dict[str, Any], asked: dict[str, Any], section: str = "") -> Iterator[str]:

@@ -60,15 +60,23 @@ class _Clamp(torch.autograd.Function):
     """Clamp to [-1, 1] through which a loss pulls inwards from anywhere, and outwards only from within."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
-        ctx.save_for_backward(x)
+    def forward(x: Tensor) -> Tensor:
         return x.clamp(-1, 1)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
         (x,) = ctx.saved_tensors
         kept: Tensor = gradient * ((x.abs() <= 1) | (gradient * x > 0))  # descent goes against the gradient
         return kept
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int], x: Tensor) -> tuple[Tensor, int]:
+        clamped: Tensor = _Clamp.apply(x)  # type: ignore[no-untyped-call]  # as above
+        return clamped, in_dims[0]  # entry by entry
 
 
 def ddpm(

@@ -62,34 +62,58 @@ class _Layers(torch.autograd.Function):
     """Activation and linear layer in turn, with the gradient written out.
 
     A chain of M passes over small layers is mostly administration otherwise: one node in the graph takes the place of
-    four a layer.
+    four a layer. What the gradient needs is returned beside the result, as `torch.vmap` wants it; under that, inputs
+    and weights are stacks of S.
     """
 
     @staticmethod
-    def forward(ctx: Any, activation: Activation, first: Tensor, *weights: Tensor) -> Tensor:
+    def forward(activation: Activation, first: Tensor, *weights: Tensor) -> tuple[Tensor, ...]:
         """From (B, width) before the first activation; weights W_1, b_1, W_2, b_2, ... as in nn.Linear."""
-        kept: list[Tensor | None] = []
+        kept: list[Tensor] = []
         for matrix, bias in zip(weights[::2], weights[1::2], strict=True):
             hidden, slope = activation(first, True)
+            assert slope is not None  # noqa: S101  # for the type checker: it was asked for
             kept += [hidden, slope]
-            first = torch.addmm(bias, hidden, matrix.T)
-        ctx.save_for_backward(*kept, *weights[::2])
-        return first
+            if matrix.dim() == 2:
+                first = torch.addmm(bias, hidden, matrix.T)
+            else:
+                first = torch.baddbmm(bias[:, None], hidden, matrix.mT)
+        return first, *kept
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        ctx.mark_non_differentiable(*output[1:])
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*output[1:], *inputs[2::2])
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
         layers = len(ctx.saved_tensors) // 3
+        if gradient is None:
+            return (None,) * (2 + 2 * layers)
         kept, matrices = ctx.saved_tensors[: 2 * layers], ctx.saved_tensors[2 * layers :]
         found: list[Tensor | None] = []
         for layer in reversed(range(layers)):
             trains_matrix, trains_bias = ctx.needs_input_grad[2 + 2 * layer : 4 + 2 * layer]
             found = [
-                gradient.T @ kept[2 * layer] if trains_matrix else None,
-                gradient.sum(dim=0) if trains_bias else None,
+                gradient.mT @ kept[2 * layer] if trains_matrix else None,
+                gradient.sum(dim=-2) if trains_bias else None,
                 *found,
             ]
             gradient = (gradient @ matrices[layer]).mul_(kept[2 * layer + 1])
         return None, gradient, *found
+
+    @staticmethod
+    def vmap(
+        info: Any, in_dims: tuple[int | None, ...], activation: Activation, *tensors: Tensor
+    ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+        """The same of stacks, S first."""
+        stacks = [
+            tensor.expand(info.batch_size, *tensor.shape) if dim is None else tensor.movedim(dim, 0)
+            for tensor, dim in zip(tensors, in_dims[1:], strict=True)
+        ]
+        out: tuple[Tensor, ...] = _Layers.apply(activation, *stacks)  # type: ignore[no-untyped-call]  # torch's own
+        return out, (0,) * len(out)
 
 
 class Layers(nn.Module):
@@ -113,7 +137,7 @@ class Layers(nn.Module):
 
     def _run(self, first: Tensor, *weights: Any) -> Tensor:
         if torch.is_grad_enabled():
-            out: Tensor = _Layers.apply(self.activation, first, *weights)  # type: ignore[no-untyped-call]  # torch's own
+            out: Tensor = _Layers.apply(self.activation, first, *weights)[0]  # type: ignore[no-untyped-call]  # torch's own
             return out
         for matrix, bias in zip(weights[::2], weights[1::2], strict=True):
             first = torch.addmm(bias, self.activation(first, False)[0], matrix.T)

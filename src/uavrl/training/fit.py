@@ -26,11 +26,14 @@ class Rows(Protocol):
         ...
 
 
+def draw_rows(data: Rows, count: int, generator: torch.Generator) -> torch.Tensor:
+    """Numbers (count,) of the rows of a minibatch, drawn with replacement."""
+    return torch.randint(0, len(data), (count,), generator=generator, device=generator.device)
+
+
 def learn_once(agent: Agent, data: Rows, generator: torch.Generator) -> Metrics:
-    """One update on a fresh minibatch, drawn with replacement."""
-    shape = (agent.config.batch_size,)
-    rows = torch.randint(0, len(data), shape, generator=generator, device=generator.device)
-    return agent.update(data.take(rows), generator)
+    """One update on a fresh minibatch."""
+    return agent.update(data.take(draw_rows(data, agent.config.batch_size, generator)), generator)
 
 
 def fit(agent: Agent, data: Batch, updates: int, generator: torch.Generator) -> dict[str, float]:

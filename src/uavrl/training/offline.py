@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from uavrl.agents.base import Batch
+from uavrl.agents.base import Batch, Metrics
 from uavrl.agents.bc import BcConfig
 from uavrl.agents.diffusion_sac import DiffusionSacConfig
 from uavrl.agents.gaussian_bc import GaussianBcConfig
@@ -35,7 +35,7 @@ from uavrl.training.log import MetricsLog, Reporter
 from uavrl.training.policy import AgentPolicy
 from uavrl.training.support import Support
 
-__all__ = ["PRESET_UPDATES", "Evaluator", "OfflineLearner", "TrainConfig"]
+__all__ = ["PRESET_UPDATES", "Evaluator", "OfflineLearner", "TrainConfig", "run_all"]
 
 Evaluator = Callable[[AgentPolicy], dict[str, float]]
 
@@ -148,13 +148,17 @@ class OfflineLearner:
             return base
         return base * 0.5 * (1.0 + math.cos(math.pi * self.updates / self.config.updates))
 
-    def step(self) -> dict[str, torch.Tensor]:
-        """One update on a fresh minibatch."""
+    def begin_step(self) -> None:
+        """Set what changes over a run: the learning rate, and the agent's `progress`."""
         rate = self._rate()
         for optimiser in self.agent.optimisers.values():
             for group in optimiser.param_groups:
                 group["lr"] = rate
         self.agent.progress = self.updates / self.config.updates
+
+    def step(self) -> Metrics:
+        """One update on a fresh minibatch."""
+        self.begin_step()
         if self.config.compilation == "graphs":
             torch.compiler.cudagraph_mark_step_begin()
         metrics = learn_once(self.agent, self.data, self.generator)
@@ -177,37 +181,10 @@ class OfflineLearner:
             ConfigError: `tensorboard`, which is not installed.
             DivergenceError: a metric is not finite, or Q beyond any possible return; the last checkpoint stays.
         """
-        policy = AgentPolicy(self.config.agent.name, self.agent, self.config.scenario)
-        config, text = self.config, ""
-        board = directory / "tensorboard" if tensorboard else None
-        with closing(MetricsLog(directory / "metrics.jsonl", board)) as log, held_interrupts() as interrupted:
-            log.cut(self.updates)
-            while self.updates < config.updates:
-                metrics = self.step()
-                stop = interrupted()
-                logs = self.updates % config.log_every == 0 or self.updates == config.updates
-                saves = self.updates % config.save_every == 0 or stop
-                tries = evaluate is not None and config.evaluate_every and self.updates % config.evaluate_every == 0
-                if logs or saves or tries:  # nothing is saved or flown that has not been looked at
-                    row = {name: float(value) for name, value in metrics.items()}
-                    self._check(row, directory)
-                if logs:
-                    row["support_distance"] = self.support_distance()
-                    log.write({"step": self.updates} | row)
-                    shown = ("q", "critic_loss", "bc_loss")
-                    text = ", ".join(f"{name} {row[name]:.3g}" for name in shown if name in row)
-                if evaluate is not None and tries:
-                    log.write({"step": self.updates} | evaluate(policy))
-                if saves:
-                    self.save(directory)
-                if stop:
-                    raise KeyboardInterrupt
-                report(self.updates, text)
-        if self.saved != self.updates:
-            self.save(directory)
-        return policy
+        return run_all([self], [directory], lambda: [self.step()], report, evaluate, tensorboard=tensorboard)[0]
 
-    def _check(self, row: dict[str, float], directory: Path) -> None:
+    def check(self, row: dict[str, float], directory: Path) -> None:
+        """Raise DivergenceError where a metric or a weight is not finite, or Q is beyond any possible return."""
         for name, value in row.items():
             if not math.isfinite(value):
                 raise self._diverged(f"{name} = {value}", directory)
@@ -271,3 +248,55 @@ class OfflineLearner:
         learner.generator.set_state(checkpoint.tensors["loop"]["generator"])
         learner.updates = learner.saved = checkpoint.document["step"]
         return learner
+
+
+def run_all(
+    learners: Sequence[OfflineLearner],
+    directories: Sequence[Path],
+    step: Callable[[], Sequence[Metrics]],
+    report: Reporter,
+    evaluate: Evaluator | None = None,
+    *,
+    tensorboard: bool = False,
+) -> list[AgentPolicy]:
+    """`OfflineLearner.run` of learners that `step` updates together, each in a directory of its own."""
+    config, text = learners[0].config, ""
+    policies = [AgentPolicy(one.config.agent.name, one.agent, one.config.scenario) for one in learners]
+    with ExitStack() as stack:
+        logs = [
+            stack.enter_context(
+                closing(MetricsLog(directory / "metrics.jsonl", directory / "tensorboard" if tensorboard else None))
+            )
+            for directory in directories
+        ]
+        interrupted = stack.enter_context(held_interrupts())
+        for learner, log in zip(learners, logs, strict=True):
+            log.cut(learner.updates)
+        while (done := learners[0].updates) < config.updates:
+            metrics, done = step(), done + 1
+            stop = interrupted()
+            logged = done % config.log_every == 0 or done == config.updates
+            saved = done % config.save_every == 0 or stop
+            tried = evaluate is not None and config.evaluate_every and done % config.evaluate_every == 0
+            for learner, directory, log, policy, values in zip(
+                learners, directories, logs, policies, metrics, strict=True
+            ):
+                if logged or saved or tried:  # nothing is saved or flown that has not been looked at
+                    row = {name: float(value) for name, value in values.items()}
+                    learner.check(row, directory)
+                if logged:
+                    row["support_distance"] = learner.support_distance()
+                    log.write({"step": done} | row)
+                    shown = ("q", "critic_loss", "bc_loss")
+                    text = ", ".join(f"{name} {row[name]:.3g}" for name in shown if name in row)
+                if evaluate is not None and tried:
+                    log.write({"step": done} | evaluate(policy))
+                if saved:
+                    learner.save(directory)
+            if stop:
+                raise KeyboardInterrupt
+            report(done, text)
+    for learner, directory in zip(learners, directories, strict=True):
+        if learner.saved != learner.updates:
+            learner.save(directory)
+    return policies

@@ -1,0 +1,71 @@
+"""Several training seeds of Diffusion-SAC in one process, as `uavrl.agents.stacked` learns them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from uavrl.agents.base import Metrics
+from uavrl.agents.diffusion_sac import DiffusionSac
+from uavrl.agents.stacked import StackedDiffusionSac
+from uavrl.errors import ConfigError
+from uavrl.training.fit import draw_rows
+from uavrl.training.log import Reporter
+from uavrl.training.offline import Evaluator, OfflineLearner, run_all
+from uavrl.training.policy import AgentPolicy
+
+
+class StackedLearner:
+    """Learners whose runs differ in their seed alone, as one.
+
+    Each keeps its own data order, noise, log and checkpoint, and can go on by itself afterwards, or in a stack again.
+
+    Raises:
+        ConfigError: another algorithm than Diffusion-SAC, compiled passes, runs that differ in more than their seed, on
+            other data, or at another update.
+    """
+
+    def __init__(self, learners: Sequence[OfflineLearner]) -> None:
+        first = learners[0]
+        for learner in learners:
+            if learner.config != first.config.model_copy(update={"seed": learner.config.seed}):
+                raise ConfigError("a stack of training seeds: the runs differ in more than their seed")
+            if learner.digest != first.digest:
+                raise ConfigError("a stack of training seeds: the runs learn from different data")
+            if learner.updates != first.updates:
+                raise ConfigError(
+                    f"a stack of training seeds: seed {first.config.seed} stands at update {first.updates:,}, seed "
+                    f"{learner.config.seed} at {learner.updates:,}; go on with each by itself"
+                )
+            learner.sample, learner.data = first.sample, first.data  # the same rows: kept once
+        if first.config.compilation != "none":
+            raise ConfigError(f"compilation = {first.config.compilation!r}, allowed for a stack of seeds: 'none'")
+        agents = [learner.agent for learner in learners if isinstance(learner.agent, DiffusionSac)]
+        if len(agents) < len(learners):
+            raise ConfigError(f"agent = {first.config.agent.name!r}, allowed for a stack of seeds: 'diffusion_sac'")
+        self.learners = list(learners)
+        self.stack = StackedDiffusionSac(agents)
+
+    def step(self) -> list[Metrics]:
+        """One update of each on a minibatch of its own."""
+        first, count = self.learners[0], len(self.learners)
+        first.begin_step()
+        generators = [learner.generator for learner in self.learners]
+        rows = [draw_rows(first.data, first.agent.config.batch_size, generator) for generator in generators]
+        metrics = self.stack.update(first.data.take(torch.cat(rows)).grouped(count), generators)
+        for learner in self.learners:
+            learner.updates += 1
+        return metrics
+
+    def run(
+        self,
+        directories: Sequence[Path],
+        report: Reporter,
+        evaluate: Evaluator | None = None,
+        *,
+        tensorboard: bool = False,
+    ) -> list[AgentPolicy]:
+        """`OfflineLearner.run` of each, in its own directory."""
+        return run_all(self.learners, directories, self.step, report, evaluate, tensorboard=tensorboard)
