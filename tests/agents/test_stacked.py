@@ -102,7 +102,7 @@ def test_a_stack_goes_on_from_its_agents_and_an_agent_from_a_stack(kind: Kind) -
             restore_agent(agent, {file: {k: v.clone() for k, v in one.items()} for file, one in tensors.items()})
     states = [one.get_state() for one in stacked_noise]
     expected = teach(kind, alone, None, noise, 2)
-    for agents, stack in ((stacks, StackedDiffusionSac(stacks)), (singles, None)):
+    for agents, stack in ((stacks, StackedDiffusionSac(stacks)), (singles, None), (first, None)):
         again = generators()
         for generator, state in zip(again, states, strict=True):
             generator.set_state(state)

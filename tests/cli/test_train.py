@@ -224,9 +224,50 @@ def test_several_seeds_are_as_many_runs(
     assert train(*words, "--out", "runs", "--seed", "4", "--seeds", "2") == 2
     assert "--out 'runs/seed5' holds a run already; give --resume" in capsys.readouterr().err
     assert not (folder / "runs/seed4").exists()
-    if not at_once:  # one by one: what is there is kept, what is not is begun
-        assert train(*words, "--out", "runs", "--seed", "4", "--seeds", "3", "--resume") == 0
-        assert load_checkpoint(folder / "runs/seed4/checkpoint").document["step"] == 2
+    again = [*words, "--out", "runs", "--seed", "4", "--seeds", "3", "--resume"]
+    assert train(*again, "--set", "learning_rate=0.1") == 2  # before anything is begun
+    assert "'runs/seed5' was started with other settings" in capsys.readouterr().err
+    assert not (folder / "runs/seed4").exists()
+    assert train(*again) == 0  # what is there goes on, what is not is begun
+    said = capsys.readouterr().err.splitlines()
+    assert {f"seed{seed}: going on from update 2" for seed in (5, 6)} <= set(said)
+    assert load_checkpoint(folder / "runs/seed4/checkpoint").document["step"] == 2
+
+
+def test_seeds_and_single_runs_do_not_mix(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["bc", "--data", "log.parquet", "--updates", "1", *SMALL]
+    assert train(*words, "--out", "one") == 0
+    assert train(*words, "--out", "one", "--seeds", "2") == 2
+    assert "--out 'one' holds a single run" in capsys.readouterr().err
+    assert train(*words, "--out", "two", "--seeds", "2") == 0
+    assert train(*words, "--out", "two", "--resume") == 2
+    assert "several seeds' (two/seed0): give --seeds" in capsys.readouterr().err
+    (folder / "three").mkdir()
+    (folder / "three/seed1").write_text("")
+    assert train(*words, "--out", "three", "--seeds", "2") == 2
+    assert "'three/seed1' cannot be made" in capsys.readouterr().err
+    assert not (folder / "three/seed0/checkpoint").exists()
+
+
+def test_one_seed_that_diverges_does_not_keep_the_next_from_learning(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from uavrl.errors import DivergenceError
+    from uavrl.training.offline import OfflineLearner
+
+    real = OfflineLearner.step
+
+    def step(self: OfflineLearner) -> object:
+        if self.config.seed == 1:
+            raise DivergenceError("training diverged: it was told to")
+        return real(self)
+
+    monkeypatch.setattr(OfflineLearner, "step", step)
+    assert train("bc", "--data", "log.parquet", "--updates", "1", "--out", "runs", "--seeds", "3", *SMALL) == 2
+    captured = capsys.readouterr()
+    assert captured.err.splitlines()[-1] == "uavrl: error: seed1: training diverged: it was told to"
+    assert [line.partition(":")[0] for line in captured.out.splitlines()] == ["seed0", "seed2"]
+    assert (folder / "runs/seed2/checkpoint").exists()
 
 
 def test_a_part_of_a_file_and_the_papers_settings(folder: Path) -> None:

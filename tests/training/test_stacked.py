@@ -113,17 +113,24 @@ def test_each_seed_is_flown_and_judged_by_itself(tmp_path: Path, flown: Transiti
     assert [[row["return"] for row in rows(place) if "return" in row] for place in places] == [[1.0, 3.0], [2.0, 4.0]]
 
 
-def test_one_seed_that_diverges_stops_all_and_harms_nothing(tmp_path: Path, flown: Transitions) -> None:  # noqa: F811
+@pytest.mark.parametrize(("spoiled_at", "found_at"), [(7, 8), (9, 10)])  # where it is logged, where it is saved
+def test_one_seed_that_diverges_stops_all_and_harms_nothing(
+    tmp_path: Path,
+    flown: Transitions,  # noqa: F811
+    spoiled_at: int,
+    found_at: int,
+) -> None:
     stack = StackedLearner(learners(flown))
     places = [tmp_path / f"{seed}" for seed in SEEDS]
 
     def spoil(done: int, text: str) -> None:
-        if done == 7:
+        if done == spoiled_at:
             stack.stack.tensors["critic.first.trunk.token.weight"].data[1].fill_(float("nan"))
 
-    with pytest.raises(DivergenceError, match=r"after 8 updates; '.*4/checkpoint' keeps update 5, the last good one"):
+    with pytest.raises(DivergenceError, match=rf"after {found_at} updates; '.*4/checkpoint' keeps update 5, the last"):
         stack.run(places, spoil)
     assert [load_checkpoint(place / "checkpoint").document["step"] for place in places] == [5, 5]
+    assert [rows(place)[-1]["step"] for place in places] == [found_at - 2] * 2
 
 
 def test_runs_that_make_no_stack_are_refused(flown: Transitions) -> None:  # noqa: F811
@@ -135,7 +142,7 @@ def test_runs_that_make_no_stack_are_refused(flown: Transitions) -> None:  # noq
     with pytest.raises(ConfigError, match="agent = 'bc', allowed for a stack of seeds: 'diffusion_sac'"):
         StackedLearner(learners(flown, name="bc"))
     second.step()
-    with pytest.raises(ConfigError, match="seed 3 stands at update 0, seed 4 at 1; go on with each by itself"):
+    with pytest.raises(ConfigError, match="seed 3 stands at update 0, seed 4 at 1"):
         StackedLearner([first, second])
 
 

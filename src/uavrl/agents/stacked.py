@@ -1,8 +1,8 @@
 """Several Diffusion-SAC learners of equal settings as one: each tensor of theirs is a slice of a stack of S.
 
-An update of all of them takes as many operations as one of a single learner, each S times as large: on a GPU, which a
-single learner leaves idle, S training seeds take hardly longer than one. The losses are `DiffusionSac`'s own under
-`torch.vmap`. Random numbers stay each learner's own, so a learner learns what it would learn alone, up to rounding.
+An update of all of them takes about twice the operations of a single learner's, however many they are, each S times as
+large: meant for a GPU, which a single learner leaves idle. The losses are `DiffusionSac`'s own under `torch.vmap`.
+Random numbers stay each learner's own, so a learner learns what it would learn alone, up to rounding.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ class StackedDiffusionSac:
 
     Args:
         agents: of equal spaces and settings, on one device, after equally many updates. Their weights and their
-            optimisers' moments become views of the stack, so what is asked of one, saved or flown, is up to date.
+            optimisers' moments become views of the stack, so what is asked of one, saved or flown, is up to date. While
+            the stack learns, none is to be updated or restored by itself.
 
     Raises:
         ValueError: none, or agents of different settings or after different numbers of updates.
@@ -39,7 +40,7 @@ class StackedDiffusionSac:
         self.agents = list(agents)
         self.tensors = {name: _stacked([_named(agent)[name] for agent in agents]) for name in _named(agents[0])}
         self.optimisers = {name: self._optimiser(name) for name in agents[0].optimisers}
-        self._linked = False
+        self._steps: list[Tensor] = []  # of the agents' optimisers, which count for themselves
 
     def _optimiser(self, name: str) -> torch.optim.Optimizer:
         """That of the stack, going on from the agents' own."""
@@ -62,10 +63,12 @@ class StackedDiffusionSac:
             for index, stack in enumerate(optimiser.param_groups[0]["params"]):
                 for row, agent in enumerate(self.agents):
                     own = agent.optimisers[name]
-                    own.state[own.param_groups[0]["params"][index]] = {
-                        key: value[row] if value.dim() else value for key, value in optimiser.state[stack].items()
+                    state = {
+                        key: value[row] if value.dim() else value.clone()
+                        for key, value in optimiser.state[stack].items()
                     }
-        self._linked = True
+                    own.state[own.param_groups[0]["params"][index]] = state
+                    self._steps.append(state["step"])
 
     def update(self, batches: Batch, generators: Sequence[torch.Generator]) -> list[Metrics]:
         """`DiffusionSac.update` of each agent, with its rows of `batches` (S, B, ...) and its own generator.
@@ -83,7 +86,9 @@ class StackedDiffusionSac:
         metrics["actor_gradient"] = self._minimise(losses, "actor")
         for (target, source), rate in zip(_AVERAGES, (config.polyak, 1.0 - config.actor_average), strict=True):
             self._move(target, source, rate)
-        if not self._linked:
+        if self._steps:
+            torch._foreach_add_(self._steps, 1)
+        else:
             self._link()
         return [{name: values[row] for name, values in metrics.items()} for row in range(len(self.agents))]
 
@@ -122,12 +127,19 @@ class StackedDiffusionSac:
 
     @torch.no_grad()
     def _move(self, target: str, source: str, rate: float) -> None:
-        pairs = [
-            (tensor, self.tensors[source + name.removeprefix(target)])
-            for name, tensor in self.tensors.items()
-            if name.startswith(target)
-        ]
-        torch._foreach_lerp_([mine for mine, _ in pairs], [theirs for _, theirs in pairs], rate)
+        """As `move_towards`."""
+        buffers = dict(self.agents[0].networks.named_buffers())
+        mine, theirs = [], []
+        for name, tensor in self.tensors.items():
+            if not name.startswith(target):
+                continue
+            other = self.tensors[source + name.removeprefix(target)]
+            if name in buffers:
+                tensor.copy_(other)
+            else:
+                mine.append(tensor)
+                theirs.append(other)
+        torch._foreach_lerp_(mine, theirs, rate)
 
 
 class _Loss(nn.Module):

@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 
 from uavrl.cli.settings import output_directory, pydantic_config, with_settings
-from uavrl.errors import ConfigError
+from uavrl.errors import ConfigError, DivergenceError
 from uavrl.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -52,8 +52,8 @@ class Train:
     seed: int = 0
     """of weights, data order and noise"""
     seeds: int = 1
-    """training seeds, from --seed on, each in a directory of its own, OUT/seed0, OUT/seed1, ...: one after another, or
-    on a GPU all at once (diffusion_sac)"""
+    """training seeds, from --seed on; two or more each have a directory of their own, OUT/seed0, OUT/seed1, ..., and
+    learn one after another, or on a GPU all at once (diffusion_sac)"""
     set: Many = ()
     """a setting as name=value, such as bc_weight=0.3 or diffusion.steps=10; repeat it for more"""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -70,11 +70,9 @@ class Train:
     def run(self) -> None:
         from uavrl.agents.registry import preset
         from uavrl.datasets import builtin_names, load_source, select
-        from uavrl.training.health import summary
-        from uavrl.training.log import progress, read_metrics, require_tensorboard
+        from uavrl.training.log import require_tensorboard
         from uavrl.training.objective import for_objective
         from uavrl.training.offline import PRESET_UPDATES, TrainConfig
-        from uavrl.training.stacked import StackedLearner
 
         if self.tensorboard:
             require_tensorboard()  # before anything that takes long
@@ -98,41 +96,33 @@ class Train:
             evaluate_every=self.evaluate_every,
             compilation=self.compile,
         )
-        output_directory(self.out)
         places = self._places(config)
         trial = trial_flights(transitions, scenario) if self.evaluate_every else None
-        every = [list(places)] if at_once(config, self.device) else [[directory] for directory in places]
-        for directories in every:
-            learners = [self._learner(directory, places[directory], transitions) for directory in directories]
-            title = f"train {self.agent}" + (f" {directories[0].name}" if self.seeds > len(learners) else "")
+        diverged: dict[str, DivergenceError] = {}
+        for learners in self._groups(places, transitions):
             try:
-                with progress(title, config.updates, "update") as report:
-                    if len(learners) > 1:
-                        StackedLearner(learners).run(directories, report, trial, tensorboard=self.tensorboard)
-                    else:
-                        learners[0].run(directories[0], report, trial, tensorboard=self.tensorboard)
-            except KeyboardInterrupt:
-                if learners[0].saved is not None:
-                    print(
-                        f"saved update {learners[0].saved:,}; the same command with --resume goes on", file=sys.stderr
-                    )
-                raise
-            for directory, learner in zip(directories, learners, strict=True):
-                of = f"{directory.name}: " if self.seeds > 1 else ""
-                print(of + summary(read_metrics(directory / "metrics.jsonl"), learner.expected))
+                self._learn(learners, trial)
+            except DivergenceError as error:  # the other seeds' turn is still to come
+                diverged[", ".join(directory.name for directory in learners)] = error
+        if diverged and self.seeds == 1:
+            raise next(iter(diverged.values()))
+        if diverged:
+            raise DivergenceError("; ".join(f"{name}: {error}" for name, error in diverged.items()))
         print(f"{updates:,} updates on {len(transitions):,} transitions; policy in {', '.join(map(str, places))}")
         judged = " ".join(f"--policy {directory}" for directory in places)
         print(f"next: uavrl evaluate --policy tdm {judged} --scenario {scenario.name}")
 
     def _places(self, config: TrainConfig) -> dict[Path, TrainConfig]:
-        """Each run's directory, free to begin in or, with --resume, begun."""
-        from uavrl.training.checkpoint import recover
-        from uavrl.training.offline import TrainConfig
+        """Each run's directory: free, or with --resume, at least one of them, begun with these settings."""
+        from uavrl.training.checkpoint import load_checkpoint, recover
+        from uavrl.training.offline import TrainConfig, began_as
 
         if self.seeds < 1:
             raise ConfigError(f"--seeds {self.seeds}, allowed: at least 1")
         places = {self.out: config}
         if self.seeds > 1:
+            if recover(self.out / "checkpoint") is not None:
+                raise ConfigError(f"--out '{self.out}' holds a single run, allowed with --seeds: another directory")
             seeds = range(self.seed, self.seed + self.seeds)
             places = {
                 self.out / f"seed{seed}": pydantic_config(TrainConfig, **dict(config) | {"seed": seed})
@@ -140,23 +130,69 @@ class Train:
             }
         begun = [directory for directory in places if recover(directory / "checkpoint") is not None]
         if self.resume and not begun:
-            raise ConfigError(f"--resume: '{self.out}' holds no checkpoint")
+            several = sorted(self.out.glob("seed*/checkpoint"))
+            hint = f" of its own, but several seeds' ({several[0].parent}): give --seeds" if several else ""
+            raise ConfigError(f"--resume: '{self.out}' holds no checkpoint{hint}")
         if begun and not self.resume:
             raise ConfigError(f"--out '{begun[0]}' holds a run already; give --resume or another directory")
+        for directory in begun:
+            began, _ = began_as(load_checkpoint(directory / "checkpoint"), directory / "checkpoint")
+            if began != places[directory]:
+                other = ", ".join(_differing(began.model_dump(), places[directory].model_dump()))
+                raise ConfigError(
+                    f"--resume: '{directory}' was started with other settings, give the same ones: {other}"
+                )
+        for directory in places:
+            output_directory(directory)
         return places
 
-    def _learner(self, directory: Path, config: TrainConfig, transitions: Transitions) -> OfflineLearner:
-        """Of one run, going on from its checkpoint with --resume."""
+    def _groups(
+        self, places: dict[Path, TrainConfig], transitions: Transitions
+    ) -> Iterator[dict[Path, OfflineLearner]]:
+        """Learners by their directories, those together that learn in one stack; each made when its turn comes."""
         from uavrl.training.offline import OfflineLearner
 
-        learner = OfflineLearner.resume(directory, transitions, self.device) if self.resume else None
-        if learner is None:
-            return OfflineLearner(config, transitions, self.device)
-        if learner.config != config:
-            began = ", ".join(_differing(learner.config.model_dump(), config.model_dump()))
-            raise ConfigError(f"--resume: '{directory}' was started with other settings, give the same ones: {began}")
-        print(f"going on from update {learner.updates:,}", file=sys.stderr)
-        return learner
+        def learner(directory: Path, config: TrainConfig) -> OfflineLearner:
+            found = OfflineLearner.resume(directory, transitions, self.device) if self.resume else None
+            if found is not None:
+                of = f"{directory.name}: " if self.seeds > 1 else ""
+                print(f"{of}going on from update {found.updates:,}", file=sys.stderr)
+            return found or OfflineLearner(config, transitions, self.device)
+
+        if not at_once(next(iter(places.values())), self.device):
+            for place in places.items():
+                yield {place[0]: learner(*place)}
+            return
+        standing: dict[int, dict[Path, OfflineLearner]] = {}
+        for place in places.items():
+            made = learner(*place)
+            standing.setdefault(made.updates, {})[place[0]] = made
+        yield from standing.values()
+
+    def _learn(self, learners: dict[Path, OfflineLearner], trial: Evaluator | None) -> None:
+        """To the end, and say how healthy each is."""
+        from uavrl.training.health import summary
+        from uavrl.training.log import progress, read_metrics
+        from uavrl.training.stacked import StackedLearner
+
+        (directory, first), *others = learners.items()
+        title = f"train {self.agent}" + (f" {directory.name}" if self.seeds > len(learners) else "")
+        try:
+            with progress(title, first.config.updates, "update") as report:
+                if others:
+                    stack = StackedLearner(list(learners.values()))
+                    stack.run(list(learners), report, trial, tensorboard=self.tensorboard)
+                else:
+                    first.run(directory, report, trial, tensorboard=self.tensorboard)
+        except KeyboardInterrupt:
+            saved = [learner.saved for learner in learners.values()]
+            least = min((updates for updates in saved if updates is not None), default=None)
+            if least is not None:
+                print(f"saved update {least:,}; the same command with --resume goes on", file=sys.stderr)
+            raise
+        for directory, learner in learners.items():
+            of = f"{directory.name}: " if self.seeds > 1 else ""
+            print(of + summary(read_metrics(directory / "metrics.jsonl"), learner.expected))
 
 
 def at_once(config: TrainConfig, device: str) -> bool:

@@ -7,6 +7,7 @@ sum of x_i, x_0 and noise. Step 1 ends on the predicted x_0 in each of them. Not
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from typing import Any, Literal, get_args
 
@@ -77,6 +78,9 @@ class _Clamp(torch.autograd.Function):
     def vmap(info: Any, in_dims: tuple[int], x: Tensor) -> tuple[Tensor, int]:
         clamped: Tensor = _Clamp.apply(x)  # type: ignore[no-untyped-call]  # as above
         return clamped, in_dims[0]  # entry by entry
+
+
+_Clamp.forward.__signature__ = inspect.signature(_Clamp.forward)  # type: ignore[attr-defined]  # torch works it out at each use
 
 
 def ddpm(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from typing import Any
 
@@ -114,6 +115,9 @@ class _Layers(torch.autograd.Function):
         ]
         out: tuple[Tensor, ...] = _Layers.apply(activation, *stacks)  # type: ignore[no-untyped-call]  # torch's own
         return out, (0,) * len(out)
+
+
+_Layers.forward.__signature__ = inspect.signature(_Layers.forward)  # type: ignore[attr-defined]  # torch works it out at each use
 
 
 class Layers(nn.Module):

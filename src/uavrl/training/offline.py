@@ -26,7 +26,14 @@ from uavrl.networks import fit_normalisers
 from uavrl.scenario import Scenario
 from uavrl.simulation.dynamics import may_terminate
 from uavrl.training.batches import OBSERVATION_OF, MappedRows, RewardTransform, spaces_of, to_batch
-from uavrl.training.checkpoint import agent_tensors, load_checkpoint, recover, restore_agent, save_checkpoint
+from uavrl.training.checkpoint import (
+    Checkpoint,
+    agent_tensors,
+    load_checkpoint,
+    recover,
+    restore_agent,
+    save_checkpoint,
+)
 from uavrl.training.compilation import Compilation, compile_passes
 from uavrl.training.fit import Rows, learn_once
 from uavrl.training.health import Expected
@@ -35,7 +42,7 @@ from uavrl.training.log import MetricsLog, Reporter
 from uavrl.training.policy import AgentPolicy
 from uavrl.training.support import Support
 
-__all__ = ["PRESET_UPDATES", "Evaluator", "OfflineLearner", "TrainConfig", "run_all"]
+__all__ = ["PRESET_UPDATES", "Evaluator", "OfflineLearner", "TrainConfig", "began_as", "run_all"]
 
 Evaluator = Callable[[AgentPolicy], dict[str, float]]
 
@@ -234,11 +241,7 @@ class OfflineLearner:
         checkpoint = load_checkpoint(path)
         if checkpoint.document.get("kind") != "offline":
             raise CheckpointError(f"checkpoint '{path}' is of kind {checkpoint.document.get('kind')!r}, not 'offline'")
-        try:
-            config = TrainConfig.model_validate(checkpoint.document["train"])
-            made_on = checkpoint.document["device"]
-        except (KeyError, ValidationError):
-            raise CheckpointError(f"checkpoint '{path}' holds no run of this version of uavrl") from None
+        config, made_on = began_as(checkpoint, path)
         if made_on != device:  # their generators differ
             raise CheckpointError(f"checkpoint '{path}' was made with device = '{made_on}', go on with the same")
         learner = cls(config, transitions, device)
@@ -248,6 +251,18 @@ class OfflineLearner:
         learner.generator.set_state(checkpoint.tensors["loop"]["generator"])
         learner.updates = learner.saved = checkpoint.document["step"]
         return learner
+
+
+def began_as(checkpoint: Checkpoint, path: Path) -> tuple[TrainConfig, str]:
+    """Settings and device of the run that saved a checkpoint at `path`.
+
+    Raises:
+        CheckpointError: it holds none of this version.
+    """
+    try:
+        return TrainConfig.model_validate(checkpoint.document["train"]), str(checkpoint.document["device"])
+    except (KeyError, ValidationError):
+        raise CheckpointError(f"checkpoint '{path}' holds no run of this version of uavrl") from None
 
 
 def run_all(
@@ -278,25 +293,28 @@ def run_all(
             logged = done % config.log_every == 0 or done == config.updates
             saved = done % config.save_every == 0 or stop
             tried = evaluate is not None and config.evaluate_every and done % config.evaluate_every == 0
-            for learner, directory, log, policy, values in zip(
-                learners, directories, logs, policies, metrics, strict=True
-            ):
-                if logged or saved or tried:  # nothing is saved or flown that has not been looked at
-                    row = {name: float(value) for name, value in values.items()}
+            if logged or saved or tried:  # nothing is saved or flown that has not been looked at, nor beside it
+                each = [{name: float(value) for name, value in values.items()} for values in metrics]
+                for learner, directory, row in zip(learners, directories, each, strict=True):
                     learner.check(row, directory)
-                if logged:
-                    row["support_distance"] = learner.support_distance()
-                    log.write({"step": done} | row)
-                    shown = ("q", "critic_loss", "bc_loss")
-                    text = ", ".join(f"{name} {row[name]:.3g}" for name in shown if name in row)
-                if evaluate is not None and tried:
+            if logged:
+                for learner, log, row in zip(learners, logs, each, strict=True):
+                    log.write({"step": done} | row | {"support_distance": learner.support_distance()})
+                shown = ("q", "critic_loss", "bc_loss")
+                text = ", ".join(f"{name} {each[0][name]:.3g}" for name in shown if name in each[0])
+            if evaluate is not None and tried:
+                for log, policy in zip(logs, policies, strict=True):
                     log.write({"step": done} | evaluate(policy))
-                if saved:
-                    learner.save(directory)
+            if saved:
+                _save_all(learners, directories)
             if stop:
                 raise KeyboardInterrupt
             report(done, text)
+        _save_all(learners, directories)
+    return policies
+
+
+def _save_all(learners: Sequence[OfflineLearner], directories: Sequence[Path]) -> None:
     for learner, directory in zip(learners, directories, strict=True):
         if learner.saved != learner.updates:
             learner.save(directory)
-    return policies

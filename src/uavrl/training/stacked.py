@@ -20,7 +20,7 @@ from uavrl.training.policy import AgentPolicy
 class StackedLearner:
     """Learners whose runs differ in their seed alone, as one.
 
-    Each keeps its own data order, noise, log and checkpoint, and can go on by itself afterwards, or in a stack again.
+    Each keeps its own data order, noise, log and checkpoint, from which it goes on by itself or in a stack again.
 
     Raises:
         ConfigError: another algorithm than Diffusion-SAC, compiled passes, runs that differ in more than their seed, on
@@ -37,14 +37,15 @@ class StackedLearner:
             if learner.updates != first.updates:
                 raise ConfigError(
                     f"a stack of training seeds: seed {first.config.seed} stands at update {first.updates:,}, seed "
-                    f"{learner.config.seed} at {learner.updates:,}; go on with each by itself"
+                    f"{learner.config.seed} at {learner.updates:,}"
                 )
-            learner.sample, learner.data = first.sample, first.data  # the same rows: kept once
         if first.config.compilation != "none":
             raise ConfigError(f"compilation = {first.config.compilation!r}, allowed for a stack of seeds: 'none'")
         agents = [learner.agent for learner in learners if isinstance(learner.agent, DiffusionSac)]
         if len(agents) < len(learners):
             raise ConfigError(f"agent = {first.config.agent.name!r}, allowed for a stack of seeds: 'diffusion_sac'")
+        for learner in learners:
+            learner.sample, learner.data = first.sample, first.data  # the same rows, kept once from here on
         self.learners = list(learners)
         self.stack = StackedDiffusionSac(agents)
 
