@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from uavrl.agents.base import Batch, Metrics
 from uavrl.agents.bc import BcConfig
@@ -35,12 +35,13 @@ from uavrl.training.checkpoint import (
     save_checkpoint,
 )
 from uavrl.training.compilation import Compilation, compile_passes
-from uavrl.training.fit import Rows, learn_once
+from uavrl.training.fit import Rows, draw_rows
 from uavrl.training.health import Expected
 from uavrl.training.interrupts import held_interrupts
 from uavrl.training.log import MetricsLog, Reporter
 from uavrl.training.policy import AgentPolicy
 from uavrl.training.support import Support
+from uavrl.training.symmetry import Turn, turned
 
 __all__ = ["PRESET_UPDATES", "Evaluator", "OfflineLearner", "TrainConfig", "began_as", "run_all"]
 
@@ -65,7 +66,24 @@ class TrainConfig(BaseModel):
     log_every: int = Field(200, ge=1, description="updates between rows of metrics.jsonl")
     save_every: int = Field(5_000, ge=1, description="updates between checkpoints")
     evaluate_every: int = Field(0, ge=0, description="updates between trial flights; 0: none")
+    symmetry: bool | None = Field(
+        None,
+        description="mirror and turn each row of a minibatch at random, as the physics allows; needs a set network. "
+        "null: where it has one and discounts by the second",
+    )
     compilation: Compilation = Field("none", description="of the networks' passes, see `compile_passes`")
+
+    @property
+    def turns(self) -> bool:
+        """Whether rows are mirrored and turned."""
+        usual = self.agent.network.kind == "devices" and self.agent.discount_per == "second"
+        return usual if self.symmetry is None else self.symmetry
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.symmetry and self.agent.network.kind != "devices":
+            raise ValueError(f"symmetry = true needs network.kind = 'devices', not {self.agent.network.kind!r}")
+        return self
 
 
 class OfflineLearner:
@@ -168,9 +186,20 @@ class OfflineLearner:
         self.begin_step()
         if self.config.compilation == "graphs":
             torch.compiler.cudagraph_mark_step_begin()
-        metrics = learn_once(self.agent, self.data, self.generator)
+        metrics = self.agent.update(self.encoded(*self.draw()), self.generator)
         self.updates += 1
         return metrics
+
+    def draw(self) -> tuple[torch.Tensor, Turn | None]:
+        """Row numbers (B,) of a minibatch, and how each row is turned."""
+        count = self.agent.config.batch_size
+        rows = draw_rows(self.data, count, self.generator)
+        return rows, Turn.draw(count, self.config.scenario.area, self.generator) if self.config.turns else None
+
+    def encoded(self, rows: torch.Tensor, turn: Turn | None) -> Batch:
+        """What the agent sees of these rows."""
+        batch = self.data.take(rows)
+        return batch if turn is None else turned(batch, turn, self.config.scenario.area)
 
     def support_distance(self) -> float:
         """How far the policy acts from the logged actions, see `Support`; the same rows and noise each time."""

@@ -11,10 +11,10 @@ from uavrl.agents.base import Metrics
 from uavrl.agents.diffusion_sac import DiffusionSac
 from uavrl.agents.stacked import StackedDiffusionSac
 from uavrl.errors import ConfigError
-from uavrl.training.fit import draw_rows
 from uavrl.training.log import Reporter
 from uavrl.training.offline import Evaluator, OfflineLearner, run_all
 from uavrl.training.policy import AgentPolicy
+from uavrl.training.symmetry import Turn
 
 
 class StackedLearner:
@@ -51,11 +51,12 @@ class StackedLearner:
 
     def step(self) -> list[Metrics]:
         """One update of each on a minibatch of its own."""
-        first, count = self.learners[0], len(self.learners)
+        first = self.learners[0]
         first.begin_step()
-        generators = [learner.generator for learner in self.learners]
-        rows = [draw_rows(first.data, first.agent.config.batch_size, generator) for generator in generators]
-        metrics = self.stack.update(first.data.take(torch.cat(rows)).grouped(count), generators)
+        rows, turns = zip(*(learner.draw() for learner in self.learners), strict=True)
+        turn = None if turns[0] is None else Turn(*(torch.cat(parts) for parts in zip(*turns, strict=True)))
+        batches = first.encoded(torch.cat(rows), turn).grouped(len(self.learners))
+        metrics = self.stack.update(batches, [learner.generator for learner in self.learners])
         for learner in self.learners:
             learner.updates += 1
         return metrics
