@@ -302,6 +302,36 @@ def test_a_pinned_level_takes_the_batchs_mean_from_the_target_and_nothing_else(k
         assert float(metrics["target_q"]) == pytest.approx(float(data.reward.mean()), abs=1e-5)
 
 
+@pytest.mark.parametrize("greedy", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+def test_advantage_learning_takes_what_the_logged_action_lacks_from_the_target(kind: Kind, greedy: bool) -> None:
+    """The loss is that of rewards lowered by beta (V'(s) - Q'(s, a)), V' of the target actor's action at s."""
+    data, eps = batch(kind, ROWS), noise(8, ROWS, 2)
+    chain = ChainNoise(noise(5, ROWS, 2 + D), noise(6, 3, ROWS, 2 + D))
+    plain, made = (
+        diffusion_sac(kind, advantage_weight=beta, action_noise=0.2, huber=None, greedy_choice=greedy)
+        for beta in (0.0, 0.7)
+    )
+    for one in (plain, made):
+        disturb(one.target, 1)
+        disturb(one.actor.average, 3)
+    with torch.no_grad():
+        vector = made.actor.sample(made.actor.average, made.actor.average.encode(data.observation), chain)
+    lack = torch.zeros(ROWS)
+    for i in range(ROWS):
+        here = row(data.observation, i)
+        w = (vector[i, :2].clamp(-1, 1) + 0.2 * eps[i]).clamp(-1, 1)
+        values = [float(q_of(made.target, here, w, d).min()) for d in range(D)]
+        value = max(values) if greedy else values[int(vector[i, 2:].argmax())]
+        lack[i] = value - float(q_of(made.target, here, data.action.continuous[i], int(data.action.choice[i])).min())
+    assert lack.abs().min() > 1e-4
+    lowered = replace(data, reward=data.reward - 0.7 * lack)
+    found, expected = made.critic_loss(data, chain, None, eps), plain.critic_loss(lowered, chain, None, eps)
+    torch.testing.assert_close(found[0], expected[0], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(found[1]["target_q"], expected[1]["target_q"], rtol=1e-4, atol=1e-5)
+    assert not torch.isclose(found[0], plain.critic_loss(data, chain, None, eps)[0])
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_action_noise_moves_what_the_critic_is_asked_about(kind: Kind) -> None:
     """w + sigma eps, held in the box: in the backup, and in L_g where it carries the gradient."""

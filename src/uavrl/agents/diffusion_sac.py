@@ -10,8 +10,8 @@ Actor, eqs. (diffRL_loss), (Q_guidance_Loss), (actor_loss_all):
 where [w, z] is what the denoising chain returns. The guidance must reach the actor's weights through that chain, for w
 and for z alike: an argmax or a sampler without graph would leave nothing but behaviour cloning.
 
-Beyond the paper: `action_noise` on w in the backup and in L_g, `pinned_level` and `greedy_choice` in the backup, the
-penalty over choices alone, the null action among a decision's candidates.
+Beyond the paper: `action_noise` on w in the backup and in L_g, `pinned_level`, `advantage_weight` and `greedy_choice`
+in the backup, the penalty over choices alone, the null action among a decision's candidates.
 """
 
 from __future__ import annotations
@@ -79,6 +79,14 @@ class DiffusionSacConfig(AgentConfig):
         description="subtract the batch's mean from Q' in the backup (as relative value iteration does; in proportion "
         "to a step's duration where discount_per is second): differences need not wait for a level that is "
         "1 / (1 - gamma) rewards away. Not for data that can terminate",
+    )
+    advantage_weight: float = Field(
+        0.0,
+        ge=0,
+        lt=1,
+        description="beta of advantage learning: the backup loses beta (V'(s) - Q'(s, a)), V' that of the target "
+        "actor's action, so what sets actions apart stands out 1 / (1 - beta) times as much beside Q's errors "
+        "(Bellemare et al. 2016, Increasing the action gap); 0 skips it",
     )
     bc_weight: float = Field(0.02, ge=0, le=1, description="eta of eq. (actor_loss_all)")
     cql_weight: float = Field(0.0, ge=0, description="alpha of eq. (crtici_CQL); 0 skips the penalty")
@@ -186,20 +194,21 @@ class DiffusionSac(Agent):
 
         Args:
             batch: B transitions.
-            noise: of the target actor's chain at s', B samples.
+            noise: of the target actor's chain at s', and at s for advantage learning, B samples.
             uniform: (B x cql_samples, C) displacements in [-1, 1] of the penalty; None where it has none, or no weight.
             jitter: (B, C) standard normal noise of w' in the backup; None: no action noise.
         """
         with torch.no_grad():
-            vector = self.actor.sample(self.actor.average, self.actor.average.encode(batch.next_observation), noise)
-            following = decode(vector, self.spaces.continuous)
-            following = following._replace(continuous=self._jittered(following.continuous, jitter))
-            q_next = self._best(self.target, self.target.encode(batch.next_observation), following)[0]
+            q_next = self._followed(batch.next_observation, noise, jitter)[1]
             if self.config.pinned_level:
                 per_second = self.config.discount_per == "second"  # a level is lost in proportion to time then
                 share = batch.duration_s / batch.duration_s.mean() if per_second else 1.0
                 q_next = q_next - q_next.mean() * share
             target = batch.reward + discounts(batch, self.config) * q_next
+            if self.config.advantage_weight > 0:
+                here, value = self._followed(batch.observation, noise, jitter)
+                logged = action_value(self.target, here, batch.action, self.spaces.choices).amin(dim=0)
+                target = target - self.config.advantage_weight * (value - logged)
         context, penalty = self.critic.encode(batch.observation), None
         if self.config.cql_weight > 0 and self.config.cql_samples == 0:
             every = self.critic.all_choices(context, batch.action.continuous)
@@ -215,6 +224,13 @@ class DiffusionSac(Agent):
             loss = loss + self.config.cql_weight * penalty
             metrics["cql_penalty"] = penalty.detach()
         return loss, metrics | {"critic_loss": loss.detach()}
+
+    def _followed(self, observation: Observation, noise: ChainNoise, jitter: Tensor | None) -> tuple[Context, Tensor]:
+        """The target critic's encoding, and min Q' (B,) of what the target actor does, as the backup sees it."""
+        actor, context = self.actor.average, self.target.encode(observation)
+        action = decode(self.actor.sample(actor, actor.encode(observation), noise), self.spaces.continuous)
+        action = action._replace(continuous=self._jittered(action.continuous, jitter))
+        return context, self._best(self.target, context, action)
 
     def actor_loss(
         self, batch: Batch, step: Tensor, noise: Tensor, chain: ChainNoise | None, jitter: Tensor | None = None
@@ -370,8 +386,8 @@ class DiffusionSac(Agent):
         """w (B, C) with action noise, in the box; its gradient leads back into the box, not out of it."""
         return w if jitter is None else straight_through_clamp(w + self.noise_now() * jitter)
 
-    def _best(self, critic: Critic, context: Context, action: HybridAction) -> tuple[Tensor, Tensor]:
-        """(min Q, choice), each (B,), of w with its own choice, or with the best one where the config says so."""
+    def _best(self, critic: Critic, context: Context, action: HybridAction) -> Tensor:
+        """Min Q (B,) of w with its own choice, or with the best one where the config says so."""
         if self.config.greedy_choice:
-            return critic.all_choices(context, action.continuous).amin(dim=0).max(dim=-1)
-        return action_value(critic, context, action, self.spaces.choices).amin(dim=0), action.choice
+            return critic.all_choices(context, action.continuous).amin(dim=0).amax(dim=-1)
+        return action_value(critic, context, action, self.spaces.choices).amin(dim=0)

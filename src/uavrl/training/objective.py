@@ -11,6 +11,7 @@ from uavrl.scenario import Scenario
 
 STEP_S = 0.4  # mean duration of a step in the built-in logs of `released`, where our presets were found
 MOST_DISCOUNT, FASTEST_POLYAK = 0.99, 0.05  # a second; an update: docs/what-matters.md
+ADVANTAGE_WEIGHT = 0.9  # of Diffusion-SAC: a step changes little, and what it changes shows in later steps alone
 
 Config = TypeVar("Config", bound=AgentConfig)
 
@@ -20,7 +21,8 @@ def for_objective(config: Config, scenario: Scenario, chosen: Sequence[str] = ()
 
     The discount is then gamma^duration (a semi-Markov decision process) of as long a horizon, at most that of
     `MOST_DISCOUNT`, and rewards, which shrink with the step, are scaled up to what a step of the other objective is
-    worth. A level that a minibatch pins is too noisy to be charged by the second: it is not pinned.
+    worth. A level that a minibatch pins is too noisy to be charged by the second: it is not pinned. Diffusion-SAC has
+    `ADVANTAGE_WEIGHT`.
 
     Args:
         config: a preset.
@@ -39,5 +41,5 @@ def for_objective(config: Config, scenario: Scenario, chosen: Sequence[str] = ()
         "reward": reward.model_copy(update={"scale": reward.scale / STEP_S, "clip": clip}),
     }
     if isinstance(config, DiffusionSacConfig):
-        changes["pinned_level"] = False
+        changes |= {"pinned_level": False, "advantage_weight": ADVANTAGE_WEIGHT}
     return config.model_copy(update=changes)
