@@ -270,6 +270,13 @@ def test_one_seed_that_diverges_does_not_keep_the_next_from_learning(
     assert (folder / "runs/seed2/checkpoint").exists()
 
 
+@pytest.mark.parametrize(("word", "kept"), [("on", True), ("off", False), ("auto", None)])
+def test_symmetry_is_a_setting_of_the_run(folder: Path, word: str, kept: bool | None) -> None:
+    words = ["bc", "--out", "run", "--data", "log.parquet", "--updates", "1", "--symmetry", word, *SMALL]
+    assert train(*words) == 0
+    assert load_checkpoint(folder / "run/checkpoint").document["train"]["symmetry"] is kept
+
+
 def test_a_part_of_a_file_and_the_papers_settings(folder: Path) -> None:
     words = ["diffusion_sac", "--out", "run", "--data", "log.parquet", "--size", "30", "--preset", "paper"]
     assert train(*words, "--updates", "1", *SMALL) == 0
@@ -305,6 +312,10 @@ def test_a_part_of_a_file_and_the_papers_settings(folder: Path) -> None:
         (["diffusion_sac", "--out", "o", "--set", "name=bc"], ["'name' does not exist"]),
         (["diffusion_sac", "--out", "o", "--set", "guidance=softmax"], ["guidance = 'softmax'", "choice_heads"]),
         (["diffusion_sac", "--out", "o", "--set", "gradient=half"], ["gradient", "'half'", "full_chain"]),
+        (
+            ["bc", "--out", "o", "--symmetry", "on", "--set", "network.kind=mlp"],
+            ["symmetry = true", "'devices'", "'mlp'"],
+        ),
         (["bc", "--out", "o", "--resume"], ["--resume", "holds no checkpoint"]),
         (["bc", "--out", "log.parquet"], ["--out", "log.parquet", "directory"]),
         (["bc", "--out", "log.parquet/run"], ["--out", "log.parquet/run", "directory"]),

@@ -56,6 +56,9 @@ class Train:
     learn one after another, or on a GPU all at once (diffusion_sac)"""
     set: Many = ()
     """a setting as name=value, such as bc_weight=0.3 or diffusion.steps=10; repeat it for more"""
+    symmetry: Literal["auto", "on", "off"] = "auto"
+    """mirror and turn each logged step at random, which the physics allows; auto: where a set network discounts by the
+    second"""
     device: Literal["cpu", "cuda"] = "cpu"
     """where to compute"""
     compile: Literal["none", "step", "graphs"] = "none"
@@ -94,6 +97,7 @@ class Train:
             seed=self.seed,
             log_every=min(LOG_EVERY, max(1, updates // 50)),  # enough rows to judge a short run by
             evaluate_every=self.evaluate_every,
+            symmetry={"auto": None, "on": True, "off": False}[self.symmetry],
             compilation=self.compile,
         )
         places = self._places(config)
