@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import pytest
 
+from uavrl.agents.diffusion_sac import DiffusionSacConfig
 from uavrl.agents.registry import preset
 from uavrl.agents.sac import SacConfig
 from uavrl.scenario import load_scenario
@@ -28,10 +29,12 @@ def test_a_typical_step_keeps_its_discount_and_the_scale_of_its_reward(config: S
     assert found.model_copy(update={name: getattr(config, name) for name in changed}) == config
 
 
-def test_a_level_is_not_pinned_by_the_second() -> None:
+def test_by_the_second_no_level_is_pinned_and_advantages_are_learned() -> None:
     config = preset("diffusion_sac", "default")
-    assert config.pinned_level  # type: ignore[union-attr]  # Diffusion-SAC's
-    assert not for_objective(config, PER_SECOND).pinned_level  # type: ignore[union-attr]  # the same
+    found = for_objective(config, PER_SECOND)
+    assert isinstance(config, DiffusionSacConfig) and isinstance(found, DiffusionSacConfig)
+    assert (config.pinned_level, config.advantage_weight) == (True, 0.0)
+    assert (found.pinned_level, found.advantage_weight) == (False, 0.9)
 
 
 def test_settings_that_are_of_seconds_or_chosen_by_hand_stay() -> None:
