@@ -43,7 +43,7 @@ from uavrl.agents.cql import conservative_penalty
 from uavrl.agents.diffusion_actor import ChainNoise, DiffusionActor, DiffusionConfig, block_mean
 from uavrl.diffusion import add_noise, predict_x0, straight_through_clamp
 from uavrl.errors import ConfigError
-from uavrl.networks import Critic, Observation, Spaces, make_critic, repeat
+from uavrl.networks import Observation, Spaces, make_critic, repeat
 from uavrl.networks.interfaces import Context
 
 
@@ -199,7 +199,7 @@ class DiffusionSac(Agent):
             jitter: (B, C) standard normal noise of w' in the backup; None: no action noise.
         """
         with torch.no_grad():
-            q_next = self._followed(batch.next_observation, noise, jitter)[1]
+            _, q_next = self._followed(batch.next_observation, noise, jitter)
             if self.config.pinned_level:
                 per_second = self.config.discount_per == "second"  # a level is lost in proportion to time then
                 share = batch.duration_s / batch.duration_s.mean() if per_second else 1.0
@@ -226,11 +226,16 @@ class DiffusionSac(Agent):
         return loss, metrics | {"critic_loss": loss.detach()}
 
     def _followed(self, observation: Observation, noise: ChainNoise, jitter: Tensor | None) -> tuple[Context, Tensor]:
-        """The target critic's encoding, and min Q' (B,) of what the target actor does, as the backup sees it."""
+        """The target critic's encoding, and its min Q' (B,) of the target actor's w, as the backup sees it.
+
+        With that actor's choice, or with the best one where the config says so.
+        """
         actor, context = self.actor.average, self.target.encode(observation)
         action = decode(self.actor.sample(actor, actor.encode(observation), noise), self.spaces.continuous)
         action = action._replace(continuous=self._jittered(action.continuous, jitter))
-        return context, self._best(self.target, context, action)
+        if self.config.greedy_choice:
+            return context, self.target.all_choices(context, action.continuous).amin(dim=0).amax(dim=-1)
+        return context, action_value(self.target, context, action, self.spaces.choices).amin(dim=0)
 
     def actor_loss(
         self, batch: Batch, step: Tensor, noise: Tensor, chain: ChainNoise | None, jitter: Tensor | None = None
@@ -385,9 +390,3 @@ class DiffusionSac(Agent):
     def _jittered(self, w: Tensor, jitter: Tensor | None) -> Tensor:
         """w (B, C) with action noise, in the box; its gradient leads back into the box, not out of it."""
         return w if jitter is None else straight_through_clamp(w + self.noise_now() * jitter)
-
-    def _best(self, critic: Critic, context: Context, action: HybridAction) -> Tensor:
-        """Min Q (B,) of w with its own choice, or with the best one where the config says so."""
-        if self.config.greedy_choice:
-            return critic.all_choices(context, action.continuous).amin(dim=0).amax(dim=-1)
-        return action_value(critic, context, action, self.spaces.choices).amin(dim=0)
