@@ -11,7 +11,7 @@ import pytest
 from tests.datasets.flights import fly, small_scenario
 from uavrl.cli import main
 from uavrl.datasets import Transitions, load_flat, load_source, save_flat, select
-from uavrl.scenario import Scenario
+from uavrl.scenario import Scenario, load_scenario
 
 
 @pytest.fixture
@@ -68,6 +68,24 @@ def test_convert_makes_a_map_and_show_reads_every_byte_of_it(
     assert complaint.count("\n") == 1
 
 
+@pytest.mark.parametrize("out", ["other.parquet", "other.npz", "other.mapped"])
+@pytest.mark.parametrize("source", ["log.parquet", "log.mapped"])
+def test_relabel_changes_rewards_and_the_objective_that_comes_with_them(
+    flown: tuple[Path, Transitions, Scenario], tmp_path: Path, source: str, out: str
+) -> None:
+    path, log, scenario = flown
+    save_flat(tmp_path / "log.mapped", log, scenario)
+    objective = tmp_path / "energy.toml"
+    objective.write_text(scenario.replace(name="energy", age_weight=0.0, energy_reference_j=1.0).to_toml())
+    words = ["data", "relabel", str(tmp_path / source), "--objective", str(objective), "--out", str(tmp_path / out)]
+    assert main(words) == 0
+    rows, carried = load_source(tmp_path / out)
+    assert carried == load_scenario(objective)
+    np.testing.assert_allclose(rows.reward, -log.next_energy_j, rtol=1e-5)
+    np.testing.assert_array_equal(rows.next_age_s, log.next_age_s)
+    assert load_source(path)[0].digest() == log.digest()
+
+
 def test_a_bad_value_stops_a_conversion_with_the_sources_name_and_leaves_nothing(
     flown: tuple[Path, Transitions, Scenario], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -99,6 +117,8 @@ def test_a_bad_value_stops_a_conversion_with_the_sources_name_and_leaves_nothing
         (["convert", "LOG", "OUT/full.mapped"], "full.mapped: exists, choose another name or remove it first"),
         (["show", "OUT/full.mapped"], "full.mapped: no whole directory of mapped flights: scenario.toml"),
         (["show", "OUT/none.mapped"], "none.mapped: no such directory"),
+        (["relabel", "LOG", "--objective", "papr", "--out", "OUT/x.npz"], "scenario 'papr'"),
+        (["relabel", "LOG", "--objective", "paper", "--out", "OUT/x.csv"], "allowed: .parquet, .npz"),
         (["convert", "LOG", "no version"], "dataset id 'no version', allowed"),
         (["show", "LOG", "--json", "LOG/figures.json"], "figures.json"),
     ],

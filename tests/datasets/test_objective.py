@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uavrl.datasets import load_builtin, relabelled, validate
-from uavrl.datasets.objective import costs
+from uavrl.datasets.objective import costs, with_objective
 from uavrl.errors import DatasetError
 from uavrl.scenario import load_scenario
 
@@ -31,3 +31,14 @@ def test_another_objective_by_hand() -> None:
 def test_another_number_of_devices_is_refused() -> None:
     with pytest.raises(DatasetError, match="data has 10 devices, the scenario 5: they must agree"):
         relabelled(load_builtin("layouts", 10), load_scenario("released", devices=5))
+
+
+def test_the_objective_and_the_priorities_are_taken_over_and_nothing_else() -> None:
+    released, paper = load_scenario("released"), load_scenario("paper")
+    assert with_objective(released, paper) == paper
+    flown = load_scenario("released", max_steps=50, fading="none")
+    wanted = paper.replace(priority=(0.55,) + (0.05,) * 9, altitude_m=60.0)
+    found = with_objective(flown, wanted)
+    assert (found.objective, found.traffic.priority) == (wanted.objective, wanted.traffic.priority)
+    assert found.name == "released-paper"
+    assert found.replace(name="released", objective=flown.objective, priority=None) == flown

@@ -86,7 +86,10 @@ REFUSED = {
     "energy": (put("next_used_j", 8, -0.1), r"row 8 .*'next_used_j' = -0.1, allowed: 0 J or more"),
     "energy in mJ": (scaled("next_energy_j", 1e3), r"row 0 .*'energy_term' = .*is the energy or the term in other"),
     "energy term": (scaled("energy_term", 2.5), r"row 0 .*'energy_term' = "),
-    "reward halved": (scaled("reward", 0.5), r"row 0 .*'reward' = .*lambda = 0.5: is the reward in other units\?"),
+    "reward halved": (
+        scaled("reward", 0.5),
+        r"row 0 .*'reward' = .*lambda = 0.5: is the reward in other units, or .* \(uavrl data relabel\)\?",
+    ),
     "reward sign": (scaled("reward", -1.0), r"row 0 .*'reward' = "),
     "one reward": (put("reward", 30, -9.0), r"row 30 .*'reward' = -9, allowed: -"),
     "episode negative": (put("episode", slice(0, 12), -1), r"row 0 .*'episode' = -1, allowed: 0 or more"),

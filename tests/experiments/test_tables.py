@@ -70,6 +70,18 @@ def test_an_objective_a_second_is_shown_a_second() -> None:
     assert "age per step, s" in table(ROWS)[0]
 
 
+@pytest.mark.parametrize(("unit", "decimals"), [(1.0, 0), (0.01, 2)])
+def test_small_returns_have_their_digits(unit: float, decimals: int) -> None:
+    rows = [row(run) for run in PLAN.comparison(PROTOCOLS["paper-objective"])]
+    for one in rows:
+        scores = one["scores"]
+        scores["flown"]["return"] = [unit * value for value in scores["flown"]["return"]]
+    header, *lines = table(rows)
+    for line in lines:
+        point = line[header.index("return")].split(" ")[0]
+        assert len(point.partition(".")[2]) == decimals
+
+
 @pytest.mark.parametrize(
     ("value", "text"),
     [

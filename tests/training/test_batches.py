@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -97,6 +97,9 @@ DURATION_S = np.array([0.5, 1.0, 2.0, 0.5, 0.25])
         (RewardConfig(transform="centred", clip=4.0, scale=3.0), False, [-4.0, 4.0, 3.0, 0.0, -3.0]),
         (RewardConfig(transform="centred", clip=None), True, REWARD),  # a shift would pay for ending, or for not ending
         (RewardConfig(transform="zscore", clip=None), False, (REWARD - REWARD.mean()) / REWARD.std()),
+        (RewardConfig(transform="robust", clip=None), False, (REWARD + 3.0) / 10.0),  # 7, 2, 1, 0, 1 from the median
+        (RewardConfig(transform="robust", clip=0.5, scale=5.0), False, [-0.5, 0.5, 0.5, 0.0, -0.5]),
+        (RewardConfig(transform="robust", clip=None), True, REWARD / 10.0),
     ],
 )
 def test_rewards_are_transformed_as_the_setting_says(config: RewardConfig, terminates: bool, expected: Any) -> None:
@@ -119,7 +122,28 @@ def test_a_level_per_second_is_the_same_for_any_cut_of_the_time_into_steps() -> 
     np.testing.assert_allclose(held.numpy(), [-1.5, 3.0, 6.0, 0.0, -0.75])  # at most 3 a second
 
 
-def test_equal_rewards_do_not_divide_by_zero() -> None:
-    config = RewardConfig(transform="zscore", clip=None)
+@pytest.mark.parametrize("discount_per", ["step", "second"])
+def test_robust_rewards_do_not_depend_on_their_unit(discount_per: str) -> None:
+    config = AgentConfig.model_validate({"discount_per": discount_per, "reward": {"transform": "robust"}})
+    duration_s = torch.from_numpy(DURATION_S)
+    found = [
+        RewardTransform.fitted(unit * REWARD, DURATION_S, config, False)(torch.from_numpy(unit * REWARD), duration_s)
+        for unit in (1.0, 1.0 / 400.0)
+    ]
+    np.testing.assert_allclose(found[0].numpy(), found[1].numpy(), rtol=1e-9)
+    apart = np.abs(found[0].numpy())
+    assert np.median(apart) == pytest.approx(0.1)
+
+
+def test_robust_rewards_of_which_half_are_equal_are_measured_by_their_mean_deviation() -> None:
+    config = AgentConfig(reward=RewardConfig(transform="robust", clip=None))
+    reward = np.array([-1.0, -1.0, -1.0, -1.0, -6.0])
+    seen = RewardTransform.fitted(reward, DURATION_S, config, False)
+    np.testing.assert_allclose(seen(torch.from_numpy(reward), torch.from_numpy(DURATION_S)).numpy()[-1], -0.5)
+
+
+@pytest.mark.parametrize("transform", ["zscore", "robust"])
+def test_equal_rewards_do_not_divide_by_zero(transform: Literal["zscore", "robust"]) -> None:
+    config = RewardConfig(transform=transform, clip=None)
     seen = RewardTransform.fitted(np.full(5, -2.0), DURATION_S, AgentConfig(reward=config), False)
     assert seen(torch.full((5,), -2.0), torch.from_numpy(DURATION_S)).abs().max() < 1e-3

@@ -11,9 +11,29 @@ from uavrl.training.objective import STEP_S, for_objective
 PER_SECOND = load_scenario("realistic")
 
 
-def test_an_objective_a_step_changes_nothing() -> None:
+def test_the_objective_that_settings_were_found_for_changes_nothing() -> None:
     config = preset("diffusion_sac", "default")
     assert for_objective(config, load_scenario("released")) is config
+    assert for_objective(config, load_scenario("released", devices=20)) is config
+
+
+@pytest.mark.parametrize("agent", ["diffusion_sac", "cql", "iql", "bcq", "bc"])
+def test_rewards_of_other_units_get_their_scale_from_the_log_for_every_algorithm(agent: str) -> None:
+    config = preset(agent, "default")
+    for scenario in (load_scenario("paper"), load_scenario("released", age_weight=0.9)):
+        found = for_objective(config, scenario)
+        assert found.reward == config.reward.model_copy(update={"transform": "robust"})
+        assert found.model_copy(update={"reward": config.reward}) == config
+
+
+def test_rewards_a_second_of_other_units_are_not_scaled_twice() -> None:
+    config = SacConfig()
+    found = for_objective(config, PER_SECOND.replace(age_reference_s=400.0))
+    assert config.reward.clip is not None
+    assert (found.discount_per, found.reward.transform, found.reward.scale) == ("second", "robust", 1.0)
+    assert found.reward.clip == for_objective(config, PER_SECOND).reward.clip
+    kept = SacConfig(reward=config.reward.model_copy(update={"transform": "none"}))
+    assert for_objective(kept, load_scenario("paper")) is kept
 
 
 @pytest.mark.parametrize("config", [SacConfig(), preset("iql", "default"), preset("bcq", "default")])

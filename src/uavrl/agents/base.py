@@ -68,10 +68,11 @@ class RewardConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    transform: Literal["none", "zscore", "centred"] = Field(
+    transform: Literal["none", "zscore", "centred", "robust"] = Field(
         "centred",
         description="zscore: eq. (rewards_norm); centred: minus the median, which puts Q near 0 from the start and "
-        "changes no optimum while episodes are only truncated",
+        "changes no optimum while episodes are only truncated; robust: centred, and over ten times the median absolute "
+        "deviation, which leaves rewards of `released` about as they are and brings those of other units there",
     )
     clip: float | None = Field(6.0, gt=0, description="transformed rewards are held in [-clip, clip]")
     scale: float = Field(1.0, gt=0, description="factor after the transform")

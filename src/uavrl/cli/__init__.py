@@ -32,6 +32,7 @@ COMMANDS: dict[str, Command] = {
     "data show": Command("uavrl.cli.data:DataShow", "report behaviour and coverage of logged flights"),
     "data select": Command("uavrl.cli.data:DataSelect", "select logged flights by size, quality and seed"),
     "data convert": Command("uavrl.cli.data:DataConvert", "write logged flights in another form"),
+    "data relabel": Command("uavrl.cli.data:DataRelabel", "give logged flights the rewards of another objective"),
     "collect": Command("uavrl.cli.collect:Collect", "log the flights of an agent that learns online"),
     "train": Command("uavrl.cli.train:Train", "learn a policy from logged flights alone"),
     "distill": Command("uavrl.cli.distill:Distill", "teach a policy of one pass what a Diffusion-SAC decides"),

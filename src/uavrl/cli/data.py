@@ -13,11 +13,13 @@ from rich.console import Console
 from uavrl.datasets.flat import SUFFIXES, save_flat
 from uavrl.datasets.mapped import MappedTransitions, save_mapped
 from uavrl.datasets.minari_io import write_minari
+from uavrl.datasets.objective import relabelled, with_objective
 from uavrl.datasets.report import describe, render
 from uavrl.datasets.selection import Quality, select
 from uavrl.datasets.sources import load_parts, load_source
 from uavrl.datasets.transitions import Transitions
 from uavrl.errors import DatasetError
+from uavrl.scenario import load_scenario
 from uavrl.simulation.observations import ObservationKind
 
 Source = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME|PATH|MINARI_ID")]
@@ -97,3 +99,27 @@ class DataConvert:
             else:
                 write_minari(self.target, transitions, scenario, self.observation)
         Console().print(f"{self.target}: {transitions!r}", highlight=False, soft_wrap=True)
+
+
+@dataclass(frozen=True)
+class DataRelabel:
+    """Write the same flights with the rewards of another objective, worked out from logged ages and energies."""
+
+    source: Source
+    """fixed, layouts or realistic, a .parquet or .npz file, a .mapped directory, or the id of a Minari dataset"""
+    objective: str
+    """preset or .toml file whose objective and priorities count; all else stays as it was flown"""
+    out: Path
+    """.parquet or .npz file, or .mapped directory, to write"""
+    scenario: str | None = None
+    """preset or .toml file that it was flown in; none: the one it carries"""
+
+    def run(self) -> None:
+        wanted = load_scenario(self.objective)
+        parts, flown = load_parts(self.source, self.scenario)
+        scenario = with_objective(flown, wanted)
+        if self.out.suffix == ".mapped":  # part by part: the log need not fit into memory
+            save_mapped(self.out, (relabelled(part, scenario) for part in parts), scenario, self.source)
+        else:
+            save_flat(self.out, relabelled(load_source(self.source, flown)[0], scenario), scenario)
+        Console().print(f"{self.out}: rewards of scenario {scenario.name}", highlight=False, soft_wrap=True)

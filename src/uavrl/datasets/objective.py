@@ -51,4 +51,15 @@ def relabelled(transitions: Transitions, scenario: Scenario) -> Transitions:
     Raises:
         DatasetError: the data's K is not the scenario's.
     """
-    return replace(transitions, **costs(transitions, scenario)._asdict())
+    rows = transitions.take(slice(None))  # mapped ones are not the mapped ones any more
+    return replace(rows, **costs(rows, scenario)._asdict())
+
+
+def with_objective(flown: Scenario, wanted: Scenario) -> Scenario:
+    """`flown` with the objective and the priorities of `wanted`: what `relabelled` may be given for its flights.
+
+    Raises:
+        ScenarioError: priorities of another number of devices.
+    """
+    changed = flown.replace(objective=wanted.objective, priority=wanted.traffic.priority, name=wanted.name)
+    return changed if changed == wanted else changed.replace(name=f"{flown.name}-{wanted.name}")

@@ -141,14 +141,15 @@ def _ranges(check: _Check, t: Transitions, scenario: Scenario) -> None:
 
 def _reward(check: _Check, t: Transitions, scenario: Scenario) -> None:
     age, energy, _ = costs(t, scenario)
-    reason = f"from the ages under scenario '{scenario.name}': are ages, durations or the term in other units?"
-    check.refuse("age_term", _apart(t.age_term, age, _ABSOLUTE_TERM), "{other} " + reason, age)
-    reason = f"from next_energy_j under scenario '{scenario.name}': is the energy or the term in other units?"
-    check.refuse("energy_term", _apart(t.energy_term, energy, _ABSOLUTE_TERM), "{other} " + reason, energy)
+    hint = " or were they logged for another objective (uavrl data relabel)?"
+    reason = f"from the ages under scenario '{scenario.name}': are ages, durations or the term in other units,"
+    check.refuse("age_term", _apart(t.age_term, age, _ABSOLUTE_TERM), "{other} " + reason + hint, age)
+    reason = f"from next_energy_j under scenario '{scenario.name}': is the energy or the term in other units,"
+    check.refuse("energy_term", _apart(t.energy_term, energy, _ABSOLUTE_TERM), "{other} " + reason + hint, energy)
     weight = scenario.objective.age_weight
     reward = -(weight * t.age_term + (1.0 - weight) * t.energy_term)
-    reason = f"= -(lambda age_term + (1 - lambda) energy_term) with lambda = {weight:g}: is the reward in other units?"
-    check.refuse("reward", _apart(t.reward, reward, _ABSOLUTE_TERM), "{other} " + reason, reward)
+    reason = f"= -(lambda age_term + (1 - lambda) energy_term) with lambda = {weight:g}: is the reward in other units,"
+    check.refuse("reward", _apart(t.reward, reward, _ABSOLUTE_TERM), "{other} " + reason + hint, reward)
 
 
 def _after(bad: NDArray[np.bool_]) -> NDArray[np.bool_]:

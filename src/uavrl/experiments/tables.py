@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -105,21 +106,23 @@ def table(rows: Sequence[Row], ours: str = OURS) -> list[list[str]]:
         "policy", "seeds", "return", "IQM", "over the planner, %", "0 TDM .. 100 planner", f"{ours} ahead by",
         f"P({ours} better)", "the other action", *metrics,
     ]  # fmt: skip
-    lines, groups = [header], grouped(rows)
-    for one in compare(rows, ours):
+    lines, groups, compared = [header], grouped(rows), compare(rows, ours)
+    least = min(abs(one.returned.mean) for one in compared)
+    digits = max(0, 2 - math.floor(math.log10(least))) if least > 0 else 0  # three significant ones of the best return
+    for one in compared:
         means = [_mean(scores(groups[one.name], metric)) for metric in metrics.values()]
         seeds = f"{one.seeds}" if one.seeds else ""
         lines.append(
             [
                 one.name,
                 seeds + (f" ({one.diverged} diverged)" if one.diverged else ""),
-                interval(one.returned, digits=0),
-                interval(one.middle, digits=0),
+                interval(one.returned, digits=digits),
+                interval(one.middle, digits=digits),
                 interval(one.excess, 100.0, digits=1),
                 interval(one.normalised, digits=0),
-                interval(one.ahead, digits=1, signed=True),
+                interval(one.ahead, digits=max(1, digits), signed=True),
                 interval(one.improves, digits=2),
-                "" if one.other_return is None else f"{one.other_return:.0f}",
+                "" if one.other_return is None else f"{one.other_return:.{digits}f}",
                 *means,
             ]
         )

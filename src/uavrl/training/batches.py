@@ -17,6 +17,8 @@ from uavrl.networks import Observation, Spaces
 from uavrl.scenario import Scenario
 from uavrl.simulation.observations import ObservationKind
 
+ROBUST_UNIT = 10.0  # median absolute deviations: that of the built-in logs' rewards in `released` is .1
+
 OBSERVATION_OF: dict[str, ObservationKind] = {"mlp": "paper", "devices": "devices"}
 
 
@@ -96,8 +98,8 @@ class RewardTransform(NamedTuple):
     ) -> RewardTransform:
         """For rewards and durations (n,) of logged steps.
 
-        "centred" subtracts the median; where an episode can terminate, a level would pay or punish ending it, so it is
-        0.
+        "centred" and "robust" subtract the median; where an episode can terminate, a level would pay or punish ending
+        it, so it is 0.
         """
         how, per_second = config.reward, config.discount_per == "second"
         values = np.asarray(reward, dtype=np.float64)
@@ -105,8 +107,13 @@ class RewardTransform(NamedTuple):
         if how.transform == "zscore":
             factor = how.scale / (float(values.std()) + 1e-6)
             return cls(float(levels.mean()), factor, how.clip, per_second)
-        centred = how.transform == "centred" and not terminates
-        return cls(float(np.median(levels)) if centred else 0.0, how.scale, how.clip, per_second)
+        level, factor = float(np.median(levels)), how.scale
+        if how.transform == "robust":
+            apart = np.abs(values - level * duration_s if per_second else values - level)
+            spread = float(np.median(apart)) or float(apart.mean()) or 1.0  # half of the rewards, or all, may be equal
+            factor /= ROBUST_UNIT * spread
+        centred = how.transform in ("centred", "robust") and not terminates
+        return cls(level if centred else 0.0, factor, how.clip, per_second)
 
     def __call__(self, reward: torch.Tensor, duration_s: torch.Tensor) -> torch.Tensor:
         """What the agent sees of rewards and durations (n,)."""

@@ -1,45 +1,52 @@
-"""Settings that were found for steps, for an objective that is counted in seconds."""
+"""Settings that were found for the objective of `released`, for one of other units, or that is counted in seconds."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from uavrl.agents.base import AgentConfig
 from uavrl.agents.diffusion_sac import DiffusionSacConfig
-from uavrl.scenario import Scenario
+from uavrl.scenario import Scenario, load_scenario
 
 STEP_S = 0.4  # mean duration of a step in the built-in logs of `released`, where our presets were found
 MOST_DISCOUNT, FASTEST_POLYAK = 0.99, 0.05  # a second; an update: docs/what-matters.md
 ADVANTAGE_WEIGHT = 0.9  # of Diffusion-SAC: a step changes little, and what it changes shows in later steps alone
+TRIED = tuple(load_scenario(name).objective for name in ("released", "realistic"))  # here scales were found by trials
 
 Config = TypeVar("Config", bound=AgentConfig)
 
 
 def for_objective(config: Config, scenario: Scenario, chosen: Sequence[str] = ()) -> Config:
-    """`config` as it is, or under a reward per second what corresponds to it for steps of `STEP_S`.
+    """`config` as it is, or what corresponds to it under an objective of other units.
 
-    The discount is then gamma^duration (a semi-Markov decision process) of as long a horizon, at most that of
-    `MOST_DISCOUNT`, and rewards, which shrink with the step, are scaled up to what a step of the other objective is
-    worth. A level that a minibatch pins is too noisy to be charged by the second: it is not pinned. Diffusion-SAC has
-    `ADVANTAGE_WEIGHT`.
+    Under a reward per second the discount is gamma^duration (a semi-Markov decision process) of as long a horizon for
+    steps of `STEP_S`, at most that of `MOST_DISCOUNT`, and rewards, which shrink with the step, are scaled up to what a
+    step of the other objective is worth. A level that a minibatch pins is too noisy to be charged by the second: it is
+    not pinned. Diffusion-SAC has `ADVANTAGE_WEIGHT`. Where references or lambda are not those of `TRIED`, rewards get
+    their scale from the log ("robust").
 
     Args:
         config: a preset.
         scenario: whose objective counts.
-        chosen: settings, name=value, that will be made by hand; with discount_per among them nothing is changed.
+        chosen: settings, name=value, to be made by hand; with discount_per among them nothing is made per second.
     """
+    objective, reward = scenario.objective, config.reward
     by_hand = any(setting.startswith("discount_per=") for setting in chosen)
-    if scenario.objective.reward == "per_step" or config.discount_per == "second" or by_hand:
-        return config
-    reward = config.reward
-    clip = None if reward.clip is None else reward.clip / STEP_S
-    changes = {
-        "discount": min(config.discount ** (1.0 / STEP_S), MOST_DISCOUNT),
-        "discount_per": "second",
-        "polyak": min(config.polyak, FASTEST_POLYAK),
-        "reward": reward.model_copy(update={"scale": reward.scale / STEP_S, "clip": clip}),
-    }
-    if isinstance(config, DiffusionSacConfig):
-        changes |= {"pinned_level": False, "advantage_weight": ADVANTAGE_WEIGHT}
-    return config.model_copy(update=changes)
+    changes: dict[str, Any] = {}
+    if objective not in TRIED and reward.transform == "centred":
+        reward = reward.model_copy(update={"transform": "robust"})
+    if objective.reward == "per_second" and config.discount_per == "step" and not by_hand:
+        clip = None if reward.clip is None else reward.clip / STEP_S
+        scale = reward.scale if reward.transform == "robust" else reward.scale / STEP_S
+        reward = reward.model_copy(update={"scale": scale, "clip": clip})
+        changes = {
+            "discount": min(config.discount ** (1.0 / STEP_S), MOST_DISCOUNT),
+            "discount_per": "second",
+            "polyak": min(config.polyak, FASTEST_POLYAK),
+        }
+        if isinstance(config, DiffusionSacConfig):
+            changes |= {"pinned_level": False, "advantage_weight": ADVANTAGE_WEIGHT}
+    if reward != config.reward:
+        changes["reward"] = reward
+    return config.model_copy(update=changes) if changes else config
