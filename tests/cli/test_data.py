@@ -86,6 +86,29 @@ def test_relabel_changes_rewards_and_the_objective_that_comes_with_them(
     assert load_source(path)[0].digest() == log.digest()
 
 
+@pytest.mark.parametrize("out", ["other.npz", "other.mapped"])
+def test_relabel_takes_only_what_is_valid_as_it_was_flown(
+    flown: tuple[Path, Transitions, Scenario], tmp_path: Path, capsys: pytest.CaptureFixture[str], out: str
+) -> None:
+    path, log, scenario = flown
+    energy = {name: 1e3 * log.columns()[name] for name in ("energy_j", "next_energy_j", "used_j", "next_used_j")}
+    table = pq.read_table(path)
+    for name, values in energy.items():
+        table = table.set_column(table.schema.get_field_index(name), name, pa.array(values.astype(np.float32)))
+    pq.write_table(table, tmp_path / "millijoules.parquet")
+    other = tmp_path / "other.toml"
+    other.write_text(scenario.replace(name="other", age_reference_s=7.0).to_toml())
+    for words, column in (
+        ([str(tmp_path / "millijoules.parquet")], "energy_term"),
+        ([str(path), "--scenario", str(other)], "age_term"),
+    ):
+        assert main(["data", "relabel", *words, "--objective", str(other), "--out", str(tmp_path / out)]) == 2
+        complaint = capsys.readouterr().err
+        assert f"column '{column}'" in complaint
+        assert complaint.count("\n") == 1
+        assert not (tmp_path / out).exists()
+
+
 def test_a_bad_value_stops_a_conversion_with_the_sources_name_and_leaves_nothing(
     flown: tuple[Path, Transitions, Scenario], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -118,7 +141,8 @@ def test_a_bad_value_stops_a_conversion_with_the_sources_name_and_leaves_nothing
         (["show", "OUT/full.mapped"], "full.mapped: no whole directory of mapped flights: scenario.toml"),
         (["show", "OUT/none.mapped"], "none.mapped: no such directory"),
         (["relabel", "LOG", "--objective", "papr", "--out", "OUT/x.npz"], "scenario 'papr'"),
-        (["relabel", "LOG", "--objective", "paper", "--out", "OUT/x.csv"], "allowed: .parquet, .npz"),
+        (["relabel", "LOG", "--objective", "released", "--out", "OUT/x.csv"], "allowed: .parquet, .npz"),
+        (["relabel", "nothing", "--objective", "paper", "--out", "OUT/x.npz"], "data 'nothing' is no built-in data"),
         (["convert", "LOG", "no version"], "dataset id 'no version', allowed"),
         (["show", "LOG", "--json", "LOG/figures.json"], "figures.json"),
     ],

@@ -15,6 +15,7 @@ from uavrl.cli import main
 from uavrl.cli.train import trial_flights
 from uavrl.datasets import save_flat
 from uavrl.evaluation.rollouts import EVALUATION_SEED, TRIAL_SEED, fixed_layout
+from uavrl.scenario import load_scenario
 from uavrl.training.checkpoint import load_checkpoint
 from uavrl.training.policy import load_policy
 
@@ -40,7 +41,7 @@ def test_a_flat_file_becomes_a_policy(folder: Path, agent: str, capsys: pytest.C
     assert train(*words) == 0
     captured = capsys.readouterr()
     assert "4 updates on 60 transitions; policy in runs/mine" in captured.out
-    assert "uavrl evaluate --policy tdm --policy runs/mine --scenario released" in captured.out
+    assert "uavrl evaluate --policy tdm --policy runs/mine --scenario runs/mine/scenario.toml" in captured.out
     assert len(captured.err.splitlines()) <= 1
     document = load_checkpoint(folder / "runs/mine/checkpoint").document
     assert (document["agent"], document["step"], document["data"]["rows"]) == (agent, 4, 60)
@@ -102,6 +103,19 @@ def test_mapped_flights_train_to_the_same_policy_and_resume(
     complaint = capsys.readouterr().err
     assert "log.mapped/rows.npy: missing, cut short or damaged" in complaint
     assert complaint.count("\n") == 1
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_the_scenario_that_the_last_line_names_is_the_one_learned_from(
+    folder: Path, capsys: pytest.CaptureFixture[str], named: bool
+) -> None:
+    """Data carry a scenario that no preset and no file of the user's may hold."""
+    (folder / "mine.toml").write_text(small_scenario().to_toml())
+    words = ["--scenario", "mine.toml"] if named else []
+    assert train("gaussian_bc", "--data", "log.parquet", "--out", "run", "--updates", "2", *SMALL[:4], *words) == 0
+    proposed = capsys.readouterr().out.splitlines()[-1].split(" --scenario ")[1]
+    assert proposed == ("mine.toml" if named else "run/scenario.toml")
+    assert load_scenario(proposed) == small_scenario()
 
 
 def test_a_run_ends_with_a_line_on_its_health(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -88,7 +88,7 @@ REFUSED = {
     "energy term": (scaled("energy_term", 2.5), r"row 0 .*'energy_term' = "),
     "reward halved": (
         scaled("reward", 0.5),
-        r"row 0 .*'reward' = .*lambda = 0.5: is the reward in other units, or .* \(uavrl data relabel\)\?",
+        r"row 0 .*'reward' = .*lambda = 0.5: is the reward in other units, or .*uavrl data relabel changes it\)\?",
     ),
     "reward sign": (scaled("reward", -1.0), r"row 0 .*'reward' = "),
     "one reward": (put("reward", 30, -9.0), r"row 30 .*'reward' = -9, allowed: -"),

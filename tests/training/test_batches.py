@@ -135,11 +135,14 @@ def test_robust_rewards_do_not_depend_on_their_unit(discount_per: str) -> None:
     assert np.median(apart) == pytest.approx(0.1)
 
 
-def test_robust_rewards_of_which_half_are_equal_are_measured_by_their_mean_deviation() -> None:
+@pytest.mark.parametrize("jitter", [0.0, 1e-8])
+def test_robust_rewards_of_which_half_are_equal_are_measured_by_their_mean_deviation(jitter: float) -> None:
     config = AgentConfig(reward=RewardConfig(transform="robust", clip=None))
-    reward = np.array([-1.0, -1.0, -1.0, -1.0, -6.0])
+    reward = np.array([-1.0, -1.0 + jitter, -1.0 - jitter, -1.0, -6.0])
     seen = RewardTransform.fitted(reward, DURATION_S, config, False)
-    np.testing.assert_allclose(seen(torch.from_numpy(reward), torch.from_numpy(DURATION_S)).numpy()[-1], -0.5)
+    np.testing.assert_allclose(
+        seen(torch.from_numpy(reward), torch.from_numpy(DURATION_S)).numpy()[-1], -0.5, rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize("transform", ["zscore", "robust"])

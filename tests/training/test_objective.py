@@ -27,12 +27,18 @@ def test_rewards_of_other_units_get_their_scale_from_the_log_for_every_algorithm
 
 
 def test_rewards_a_second_of_other_units_are_not_scaled_twice() -> None:
-    config = SacConfig()
-    found = for_objective(config, PER_SECOND.replace(age_reference_s=400.0))
+    config, scenario = preset("iql", "default"), PER_SECOND.replace(age_reference_s=400.0)
+    found = for_objective(config, scenario)
     assert config.reward.clip is not None
     assert (found.discount_per, found.reward.transform, found.reward.scale) == ("second", "robust", 1.0)
     assert found.reward.clip == for_objective(config, PER_SECOND).reward.clip
-    kept = SacConfig(reward=config.reward.model_copy(update={"transform": "none"}))
+    by_hand = for_objective(config, scenario, ["reward.transform=zscore"])
+    assert by_hand == for_objective(config, PER_SECOND)
+
+
+def test_an_online_learner_has_no_log_and_another_transform_stays() -> None:
+    assert for_objective(SacConfig(), load_scenario("paper")) == SacConfig()
+    kept = preset("iql", "paper")
     assert for_objective(kept, load_scenario("paper")) is kept
 
 

@@ -1,4 +1,4 @@
-"""`uavrl data`: show, select and convert logged flights."""
+"""`uavrl data`: show, select, convert and relabel logged flights."""
 
 from __future__ import annotations
 
@@ -116,10 +116,11 @@ class DataRelabel:
 
     def run(self) -> None:
         wanted = load_scenario(self.objective)
-        parts, flown = load_parts(self.source, self.scenario)
+        transitions, flown = load_source(self.source, self.scenario)  # a log that is not valid is not made to look so
         scenario = with_objective(flown, wanted)
-        if self.out.suffix == ".mapped":  # part by part: the log need not fit into memory
-            save_mapped(self.out, (relabelled(part, scenario) for part in parts), scenario, self.source)
+        if self.out.suffix == ".mapped":  # part by part: a mapped log need not fit into memory
+            parts = (relabelled(part, scenario) for part in transitions.parts())
+            save_mapped(self.out, parts, scenario, self.source)
         else:
-            save_flat(self.out, relabelled(load_source(self.source, flown)[0], scenario), scenario)
+            save_flat(self.out, relabelled(transitions, scenario), scenario)
         Console().print(f"{self.out}: rewards of scenario {scenario.name}", highlight=False, soft_wrap=True)

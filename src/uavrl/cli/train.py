@@ -14,7 +14,7 @@ import tyro
 
 from uavrl.cli.settings import output_directory, pydantic_config, with_settings
 from uavrl.errors import ConfigError, DivergenceError
-from uavrl.scenario import Scenario
+from uavrl.scenario import PRESETS, Scenario
 
 if TYPE_CHECKING:
     from uavrl.datasets import Transitions
@@ -114,7 +114,18 @@ class Train:
             raise DivergenceError("; ".join(f"{name}: {error}" for name, error in diverged.items()))
         print(f"{updates:,} updates on {len(transitions):,} transitions; policy in {', '.join(map(str, places))}")
         judged = " ".join(f"--policy {directory}" for directory in places)
-        print(f"next: uavrl evaluate --policy tdm {judged} --scenario {scenario.name}")
+        print(f"next: uavrl evaluate --policy tdm {judged} --scenario {self._named(scenario, next(iter(places)))}")
+
+    def _named(self, scenario: Scenario, directory: Path) -> str:
+        """What `--scenario` takes to mean it; a file in `directory` where it has no name."""
+        from uavrl.evaluation.report import write_text
+
+        if self.scenario is not None:
+            return self.scenario
+        if PRESETS.get(scenario.name) == scenario:
+            return scenario.name
+        write_text(directory / "scenario.toml", scenario.to_toml())
+        return str(directory / "scenario.toml")
 
     def _places(self, config: TrainConfig) -> dict[Path, TrainConfig]:
         """Each run's directory: free, or with --resume, at least one of them, begun with these settings."""

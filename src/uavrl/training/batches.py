@@ -110,7 +110,9 @@ class RewardTransform(NamedTuple):
         level, factor = float(np.median(levels)), how.scale
         if how.transform == "robust":
             apart = np.abs(values - level * duration_s if per_second else values - level)
-            spread = float(np.median(apart)) or float(apart.mean()) or 1.0  # half of the rewards, or all, may be equal
+            spread = float(np.median(apart))
+            if spread <= 1e-6 * np.abs(values).max():  # half of the rewards, or all, are equal
+                spread = float(apart.mean()) or 1.0
             factor /= ROBUST_UNIT * spread
         centred = how.transform in ("centred", "robust") and not terminates
         return cls(level if centred else 0.0, factor, how.clip, per_second)

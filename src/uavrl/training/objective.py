@@ -1,4 +1,4 @@
-"""Settings that were found for the objective of `released`, for one of other units, or that is counted in seconds."""
+"""Settings that were found for the objective of `released`, for another one."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 from uavrl.agents.base import AgentConfig
 from uavrl.agents.diffusion_sac import DiffusionSacConfig
+from uavrl.agents.sac import SacConfig
 from uavrl.scenario import Scenario, load_scenario
 
 STEP_S = 0.4  # mean duration of a step in the built-in logs of `released`, where our presets were found
@@ -18,25 +19,27 @@ Config = TypeVar("Config", bound=AgentConfig)
 
 
 def for_objective(config: Config, scenario: Scenario, chosen: Sequence[str] = ()) -> Config:
-    """`config` as it is, or what corresponds to it under an objective of other units.
+    """`config` as it is, or what corresponds to it under another objective than that of `released`.
 
     Under a reward per second the discount is gamma^duration (a semi-Markov decision process) of as long a horizon for
     steps of `STEP_S`, at most that of `MOST_DISCOUNT`, and rewards, which shrink with the step, are scaled up to what a
     step of the other objective is worth. A level that a minibatch pins is too noisy to be charged by the second: it is
-    not pinned. Diffusion-SAC has `ADVANTAGE_WEIGHT`. Where references or lambda are not those of `TRIED`, rewards get
-    their scale from the log ("robust").
+    not pinned. Diffusion-SAC has `ADVANTAGE_WEIGHT`. Under any objective that is none of `TRIED` an offline algorithm's
+    rewards get their scale from the log ("robust"); an online one has no log to take it from.
 
     Args:
         config: a preset.
         scenario: whose objective counts.
-        chosen: settings, name=value, to be made by hand; with discount_per among them nothing is made per second.
+        chosen: settings, name=value, to be made by hand: with discount_per among them nothing is made per second, with
+            reward.transform the scale does not come from the log.
     """
     objective, reward = scenario.objective, config.reward
-    by_hand = any(setting.startswith("discount_per=") for setting in chosen)
+    by_hand = {setting.partition("=")[0] for setting in chosen}
     changes: dict[str, Any] = {}
-    if objective not in TRIED and reward.transform == "centred":
+    offline = not isinstance(config, SacConfig)
+    if objective not in TRIED and offline and reward.transform == "centred" and "reward.transform" not in by_hand:
         reward = reward.model_copy(update={"transform": "robust"})
-    if objective.reward == "per_second" and config.discount_per == "step" and not by_hand:
+    if objective.reward == "per_second" and config.discount_per == "step" and "discount_per" not in by_hand:
         clip = None if reward.clip is None else reward.clip / STEP_S
         scale = reward.scale if reward.transform == "robust" else reward.scale / STEP_S
         reward = reward.model_copy(update={"scale": scale, "clip": clip})

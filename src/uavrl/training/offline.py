@@ -90,7 +90,7 @@ class OfflineLearner:
     """An agent, its data, and the generator of data order and noise.
 
     Data in memory become tensors at once. Of mapped data each minibatch is read when it is drawn, and statistics (the
-    reward's median, mean and deviation, the normalisers', the rows that `Support` knows) are of `SAMPLE_ROWS` rows, the
+    reward's median, mean, deviations, the normalisers', the rows that `Support` knows) are of `SAMPLE_ROWS` rows, the
     same every time, or of all where there are fewer; least and largest reward and the shortest step are of all rows. So
     memory does not grow with mapped data, and up to `SAMPLE_ROWS` rows they train as in memory, bit for bit.
 

@@ -64,10 +64,9 @@ class OnlineLearner:
     def __init__(self, config: CollectConfig) -> None:
         self.config = config
         scenario = config.scenario
-        if config.agent.reward.transform == "zscore":
-            raise ConfigError(
-                "reward.transform = 'zscore' needs all data, allowed while collecting: 'centred', 'robust', 'none'"
-            )
+        how = config.agent.reward.transform
+        if how in ("zscore", "robust"):
+            raise ConfigError(f"reward.transform = '{how}' needs all data, allowed while collecting: 'centred', 'none'")
         self.kind = OBSERVATION_OF[config.agent.network.kind]
         environment = gymnasium.make_vec(
             ENVIRONMENT_ID,
@@ -95,7 +94,7 @@ class OnlineLearner:
         self.saved: int | None = None  # the step of the last checkpoint
         reward = config.agent.reward
         self.seen = RewardTransform(0.0, reward.scale, reward.clip, config.agent.discount_per == "second")
-        self.centres = reward.transform in ("centred", "robust") and not may_terminate(scenario)
+        self.centres = reward.transform == "centred" and not may_terminate(scenario)
 
     def _act(self) -> FlightAction:
         reach = self.config.scenario.airframe.max_displacement_m
@@ -132,8 +131,7 @@ class OnlineLearner:
     def _recentre(self) -> None:
         """Zero of the reward: the median of the newest rewards; zero of Q: its mean over the newest states."""
         newest = self.log.take(np.arange(max(0, len(self.log) - 5_000), len(self.log)))
-        fitted = RewardTransform.fitted(newest.reward, newest.duration_s, self.config.agent, terminates=False)
-        self.seen = self.seen._replace(level=fitted.level)
+        self.seen = RewardTransform.fitted(newest.reward, newest.duration_s, self.config.agent, terminates=False)
         batch = to_batch(newest.take(slice(-1_000, None)), self.kind, self.config.scenario)
         with torch.no_grad():
             critic = self.agent.critic
@@ -146,8 +144,6 @@ class OnlineLearner:
         if self.updates == 0:
             first = self.log.take(np.arange(len(self.log)))
             fit_normalisers(self.agent.networks, to_tensors(first.observations(self.kind, self.config.scenario)[0]))
-            fitted = RewardTransform.fitted(first.reward, first.duration_s, self.config.agent, not self.centres)
-            self.seen = fitted  # its factor stays: Q could not follow another scale
         if self.centres and self.updates % self.config.centre_every == 0:
             self._recentre()
         rows = self.numbers.integers(0, len(self.log), self.config.agent.batch_size)
@@ -212,7 +208,6 @@ class OnlineLearner:
             "finished": self.finished,
             "updates": self.updates,
             "centre": self.seen.level,
-            "factor": self.seen.factor,
             "numbers": numpy_state(self.numbers),
             "environment": numpy_state(self.environment.np_random),
         }
@@ -262,9 +257,7 @@ class OnlineLearner:
         learner.generator.set_state(tensors["loop"]["generator"])
         learner.episode, learner.returns, learner.ended = loop["episode"], loop["returns"], loop["ended"]
         learner.finished, learner.updates = document["finished"], document["updates"]
-        learner.seen = learner.seen._replace(
-            level=document["centre"], factor=document.get("factor", learner.seen.factor)
-        )
+        learner.seen = learner.seen._replace(level=document["centre"])
         learner.saved = len(learner.log)
         learner.observation = learner.environment.observation()
         return learner
