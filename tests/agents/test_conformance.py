@@ -26,9 +26,10 @@ from tests.agents.problems import (
     spaces,
 )
 from uavrl.agents.base import Agent
+from uavrl.agents.diffusion_sac import _deviation
 from uavrl.agents.registry import PRESETS, make_agent, preset
 from uavrl.errors import CheckpointError, ConfigError
-from uavrl.networks import Observation, Spaces
+from uavrl.networks import Observation, Spaces, repeat
 from uavrl.training.checkpoint import agent_tensors, load_checkpoint, restore_agent, save_checkpoint
 
 EVERY = [(name, kind) for name in NAMES for kind in KINDS]
@@ -132,6 +133,7 @@ def test_a_padded_device_is_never_chosen(name: str, deterministic: bool) -> None
         {"candidates": 3, "greedy_choice": False},
         {"candidates": 2},
         {"null_candidate": True},
+        {"choice_prior": 2.0, "null_candidate": True},
     ]
     for changes in settings if name == "diffusion_sac" else [{}]:
         made = agent(name, "devices", **changes)
@@ -282,7 +284,57 @@ def test_the_null_action_is_taken_where_the_critic_finds_it_better(kind: Kind, s
     assert (action.choice[holds] == 0).all()
     assert (action.continuous[holds] == 0).all()
     assert torch.equal(action.choice[~holds], acted.choice[~holds])
-    assert torch.equal(action.continuous[~holds], acted.continuous[~holds])
+    flies = ~holds & (acted.choice > 0)
+    assert torch.equal(action.continuous[flies], acted.continuous[flies])
+    assert (action.continuous[action.choice == 0] == 0).all()  # who idles, whyever, holds its place
+
+
+@pytest.mark.parametrize("candidates", [1, 3])
+@pytest.mark.parametrize("null", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_chains_opinion_counts_beside_the_critics_in_units_of_its_deviation(
+    kind: Kind, null: bool, candidates: int
+) -> None:
+    made = diffusion_sac(kind, candidates=candidates, null_candidate=null, choice_prior=0.7)
+    disturb(made.actor.average, 8)
+    seen, rows = observation(kind, 60), 60
+    context = repeat(made.actor.average.encode(seen), candidates)
+    vector = made.actor.answer(context, made.actor.draw(context, generator(1)))
+    w, z = vector[:, :2].clamp(-1.0, 1.0).view(rows, candidates, 2), vector[:, 2:].view(rows, candidates, -1)
+    if null:
+        w, z = torch.cat([w, torch.zeros(rows, 1, 2)], dim=1), torch.cat([z, z.mean(dim=1, keepdim=True)], dim=1)
+    with torch.no_grad():
+        encoded = made.critic.encode(seen)
+        q = torch.stack([made.critic.all_choices(encoded, w[:, k]).amin(dim=0) for k in range(w.shape[1])], dim=1)
+    score = q + 0.7 * q.flatten(1).std(dim=1, correction=0)[:, None, None] * z
+    if null:
+        score[:, candidates, 1:] = -torch.inf
+    best = score.flatten(1).argmax(dim=1)
+    number, choice = best // z.shape[2], best % z.shape[2]
+    wanted = w[torch.arange(rows), number]
+    if null:
+        wanted = torch.where((choice > 0)[:, None], wanted, 0.0)
+    action = made.act(seen, generator=generator(1))
+    assert torch.equal(action.choice, choice)
+    torch.testing.assert_close(action.continuous, wanted)
+    made.config = made.config.model_copy(update={"choice_prior": 0.0})
+    assert not torch.equal(made.act(seen, generator=generator(1)).choice, choice)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_chain_that_is_believed_above_all_chooses_alone_but_for_ties(kind: Kind) -> None:
+    """Entries of a chain are clipped to 1, so several may be the largest."""
+    made, seen = diffusion_sac(kind, choice_prior=1e6), observation(kind, 60)
+    z = made.actor.answer(made.actor.average.encode(seen), None)[:, 2:]
+    choice = made.act(seen, generator=generator(1), deterministic=True).choice
+    assert torch.equal(z.gather(1, choice[:, None])[:, 0], z.amax(dim=1))
+    assert len(choice.unique()) > 1
+
+
+def test_a_padded_device_does_not_widen_the_deviation() -> None:
+    q = torch.tensor([[[-3.0, -1.0, -2.0, -1e4], [-4.0, 0.0, -2.0, -1e4]]])
+    real = torch.tensor([-3.0, -1.0, -2.0, -4.0, 0.0, -2.0])
+    assert float(_deviation(q)) == pytest.approx(float(real.std(correction=0)))
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from tests.agents.problems import DEVICES, KINDS, Kind, agent, batch, copies, diffusion_sac, disturb, equal, noise
-from uavrl.actions import decode
 from uavrl.agents.one_step import OneStep, OneStepConfig
 from uavrl.networks import NetworkConfig
 
@@ -51,7 +50,7 @@ def teachers_decisions(made: OneStep, data: Any, start: Tensor) -> Any:
     actor = made.teacher.actor
     context = actor.average.encode(data.observation)
     vector = actor.average.possible(context, actor.map(actor.average, context, start))
-    return made.teacher.best(data.observation, decode(vector, 2), 1)
+    return made.teacher.best(data.observation, vector, 1)
 
 
 @BOTH

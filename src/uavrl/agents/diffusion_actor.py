@@ -163,13 +163,17 @@ class DiffusionActor(nn.Module):
         return ChainNoise.draw(len(context[0]), self.average.vector_size(context), self.noise_steps, generator)
 
     @torch.no_grad()
-    def decide(self, context: Context, noise: ChainNoise | None) -> HybridAction:
-        """One action a row by the average network; without noise: from x_M = 0."""
+    def answer(self, context: Context, noise: ChainNoise | None) -> Tensor:
+        """One vector (C + D) a row by the average network; without noise: from x_M = 0."""
         if noise is not None and self.solver is None:
             vector = self.sample(self.average, context, noise)
         else:
             vector = self.map(self.average, context, None if noise is None else noise.start)
-        return decode(self.average.possible(context, vector), self.continuous)
+        return self.average.possible(context, vector)
+
+    def decide(self, context: Context, noise: ChainNoise | None) -> HybridAction:
+        """The action of `answer`."""
+        return decode(self.answer(context, noise), self.continuous)
 
 
 def block_mean(error: Tensor, continuous: int, weight: float) -> Tensor:

@@ -44,6 +44,7 @@ from uavrl.agents.diffusion_actor import ChainNoise, DiffusionActor, DiffusionCo
 from uavrl.diffusion import add_noise, predict_x0, straight_through_clamp
 from uavrl.errors import ConfigError
 from uavrl.networks import Observation, Spaces, make_critic, repeat
+from uavrl.networks.devices import NEVER
 from uavrl.networks.interfaces import Context
 
 
@@ -115,12 +116,18 @@ class DiffusionSacConfig(AgentConfig):
         description="d' of the backup and d of a decision: the critic's best for the actor's w; false: the actor's own "
         "(paper). The critic knows every choice from one pass, and the data hold all of them, some rarely",
     )
+    choice_prior: float = Field(
+        0.0,
+        ge=0,
+        description="weight, in units of Q's deviation over the choices, of the chain's own entries z beside the "
+        "critic's Q where that says d of a decision; 0: the critic alone",
+    )
     candidates: int = Field(1, ge=1, description="actions drawn at a decision; the one of largest min Q is taken")
     null_candidate: bool = Field(
         False,
         description="beside them stands the null action, w = 0 with choice 0 (hold the place, serve nobody), which no "
-        "network hits: of a move's cost the first metre is as dear as the last. Not in the backup. Where no critic is "
-        "asked (greedy_choice false, one candidate) it stands for the actor's idling",
+        "network hits: of a move's cost the first metre is as dear as the last; who idles at a decision holds its "
+        "place. Not in the backup",
     )
 
     @model_validator(mode="after")
@@ -144,6 +151,14 @@ class DiffusionSacConfig(AgentConfig):
 def held(action: HybridAction) -> HybridAction:
     """Actions (N) with w = 0, which no network hits, where the choice is 0: who idles holds its place."""
     return action._replace(continuous=action.continuous * (action.choice > 0)[:, None])
+
+
+def _deviation(every: Tensor) -> Tensor:
+    """Standard deviation of Q (N, M, D) over the choices of all M candidates, (N, 1, 1), padded devices left out."""
+    real = every > NEVER / 2
+    count = real.sum(dim=(1, 2), keepdim=True)
+    mean = torch.where(real, every, 0.0).sum(dim=(1, 2), keepdim=True) / count
+    return (torch.where(real, every - mean, 0.0).square().sum(dim=(1, 2), keepdim=True) / count).sqrt()
 
 
 class CriticNoise(NamedTuple):
@@ -357,21 +372,26 @@ class DiffusionSac(Agent):
 
     def _decide(self, observation: Observation, context: Context, noise: ChainNoise | None) -> HybridAction:
         """The best of a row's candidates, whose encodings stand one after another in `context`; 1 without noise."""
-        return self.best(observation, self.actor.decide(context, noise), 1 if noise is None else self.config.candidates)
+        return self.best(observation, self.actor.answer(context, noise), 1 if noise is None else self.config.candidates)
 
-    def best(self, observation: Observation, drawn: HybridAction, count: int) -> HybridAction:
-        """Of each row's `count` drawn actions, one after another, that of largest min Q; its choice as configured."""
-        config = self.config
+    def best(self, observation: Observation, vector: Tensor, count: int) -> HybridAction:
+        """Of each row's `count` chain outputs (C + D), in turn, the best by min Q, its choice as configured."""
+        config, continuous = self.config, self.spaces.continuous
+        drawn = decode(vector, continuous)
         if count == 1 and not config.greedy_choice:
             return held(drawn) if config.null_candidate else drawn
-        rows = drawn.choice.shape[0] // count
+        rows = vector.shape[0] // count
         w, choice = drawn.continuous.view(rows, count, -1), drawn.choice.view(rows, count)
+        z = vector[:, continuous:].view(rows, count, -1)
         if config.null_candidate:  # in the same pass, last: where it is no better than another the other is taken
             w = torch.cat([w, torch.zeros_like(w[:, :1])], dim=1)
+            z = torch.cat([z, z.mean(dim=1, keepdim=True)], dim=1)
         each = count + int(config.null_candidate)
         context = repeat(self.critic.encode(observation), each)
         every = self.critic.all_choices(context, w.flatten(0, 1)).amin(dim=0).view(rows, each, -1)
         if config.greedy_choice:
+            if config.choice_prior > 0:
+                every = every + config.choice_prior * _deviation(every) * z
             q, choice = every[:, :count].max(dim=2)
         else:
             q = every[:, :count].gather(2, choice[..., None]).squeeze(2)
@@ -380,7 +400,8 @@ class DiffusionSac(Agent):
             choice = torch.cat([choice, torch.zeros_like(choice[:, :1])], dim=1)
         best = q.argmax(dim=1, keepdim=True)
         w = w.gather(1, best[..., None].expand(-1, -1, w.shape[2]))
-        return HybridAction(w.squeeze(1), choice.gather(1, best).squeeze(1))
+        chosen = HybridAction(w.squeeze(1), choice.gather(1, best).squeeze(1))
+        return held(chosen) if config.null_candidate else chosen
 
     def noise_now(self) -> float:
         """Standard deviation of the action noise at this share of the training."""

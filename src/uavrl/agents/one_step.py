@@ -106,8 +106,7 @@ class OneStep(Agent):
         if config.choice == "critic":
             distance = block_mean((answer - wanted).square(), continuous, config.displacement_weight)
         else:
-            drawn = decode(teacher.average.possible(context, wanted), continuous)
-            decided = self.teacher.best(batch.observation, drawn, 1)
+            decided = self.teacher.best(batch.observation, teacher.average.possible(context, wanted), 1)
             logits = self.student.possible(encoded, answer)[:, continuous:]
             distance = config.displacement_weight * (answer[:, :continuous] - decided.continuous).square().mean()
             distance = distance + functional.cross_entropy(logits, decided.choice)
@@ -142,9 +141,9 @@ class OneStep(Agent):
             start = noise.reshape(count * context[0].shape[0], self.average.vector_size(context))
         context = repeat(context, count)
         vector = self.average.possible(context, self.map(self.average, context, start))
-        answer = decode(vector, self.spaces.continuous)
         if self.config.choice == "critic":
-            return self.teacher.best(observation, answer, count)
+            return self.teacher.best(observation, vector, count)
+        answer = decode(vector, self.spaces.continuous)
         return held(answer) if self.config.teacher.null_candidate else answer
 
     @torch.no_grad()

@@ -60,6 +60,7 @@ PRESETS: dict[str, dict[str, Offline]] = {
             cql_samples=0,
             huber=3.0,
             reward=RewardConfig(clip=10.0),
+            choice_prior=1.0,
             null_candidate=True,
         ),
         "paper": DiffusionSacConfig(

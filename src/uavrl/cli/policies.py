@@ -19,7 +19,14 @@ from uavrl.scenario import Scenario
 if TYPE_CHECKING:
     from uavrl.training.policy import Decision
 
-SETTINGS = ("candidates=N", "null_candidate=true|false", "greedy_choice=true|false", "solver=ddim|dpm", "steps=N")
+SETTINGS = (
+    "candidates=N",
+    "null_candidate=true|false",
+    "greedy_choice=true|false",
+    "choice_prior=X",
+    "solver=ddim|dpm",
+    "steps=N",
+)
 
 
 def resolve(spec: str, scenario: Scenario) -> Policy:

@@ -24,7 +24,7 @@ def for_objective(config: Config, scenario: Scenario, chosen: Sequence[str] = ()
     Under a reward per second the discount is gamma^duration (a semi-Markov decision process) of as long a horizon for
     steps of `STEP_S`, at most that of `MOST_DISCOUNT`, and rewards, which shrink with the step, are scaled up to what a
     step of the other objective is worth. A level that a minibatch pins is too noisy to be charged by the second: it is
-    not pinned. Diffusion-SAC has `ADVANTAGE_WEIGHT`. Under any objective that is none of `TRIED` an offline algorithm's
+    not pinned. Diffusion-SAC has `ADVANTAGE_WEIGHT` and believes its critic alone. Under any objective that is none of `TRIED` an offline algorithm's
     rewards get their scale from the log ("robust"); an online one has no log to take it from.
 
     Args:
@@ -49,7 +49,7 @@ def for_objective(config: Config, scenario: Scenario, chosen: Sequence[str] = ()
             "polyak": min(config.polyak, FASTEST_POLYAK),
         }
         if isinstance(config, DiffusionSacConfig):
-            changes |= {"pinned_level": False, "advantage_weight": ADVANTAGE_WEIGHT}
+            changes |= {"pinned_level": False, "advantage_weight": ADVANTAGE_WEIGHT, "choice_prior": 0.0}
     if reward != config.reward:
         changes["reward"] = reward
     return config.model_copy(update=changes) if changes else config

@@ -41,6 +41,9 @@ class Decision(BaseModel):
         None,
         description="whether the critic says whom to serve, or the actor itself: with one candidate no critic is asked",
     )
+    choice_prior: float | None = Field(
+        None, ge=0, description="weight of the actor's own opinion where the critic says whom to serve"
+    )
     solver: SolverName | None = Field(None, description="ddim without noise, or dpm: DPM-Solver++(2M)")
     steps: int | None = Field(None, ge=1, description="of the solver, at most M; by default M")
 
@@ -61,6 +64,7 @@ class Decision(BaseModel):
             ("candidates", "agents that re-rank"),
             ("null_candidate", "Diffusion-SAC"),
             ("greedy_choice", "Diffusion-SAC"),
+            ("choice_prior", "Diffusion-SAC"),
         ):
             value = getattr(self, setting)
             if value is None:
