@@ -24,8 +24,9 @@ def for_objective(config: Config, scenario: Scenario, chosen: Sequence[str] = ()
     Under a reward per second the discount is gamma^duration (a semi-Markov decision process) of as long a horizon for
     steps of `STEP_S`, at most that of `MOST_DISCOUNT`, and rewards, which shrink with the step, are scaled up to what a
     step of the other objective is worth. A level that a minibatch pins is too noisy to be charged by the second: it is
-    not pinned. Diffusion-SAC has `ADVANTAGE_WEIGHT` and believes its critic alone. Under any objective that is none of `TRIED` an offline algorithm's
-    rewards get their scale from the log ("robust"); an online one has no log to take it from.
+    not pinned. Diffusion-SAC has `ADVANTAGE_WEIGHT` and believes its critic alone. Under any objective that is none of
+    `TRIED` an offline algorithm's rewards get their scale from the log ("robust"); an online one has no log to take it
+    from.
 
     Args:
         config: a preset.
