@@ -181,7 +181,9 @@ def _limits(points: Sequence[Point], extra: Sequence[float]) -> tuple[float, flo
 
 def _outside(axes: Axes, names: Sequence[str]) -> None:
     if names:
-        axes.text(0.02, 0.02, "not shown: " + ", ".join(names), transform=axes.transAxes, fontsize=5.5, color="#777777")
+        lines = [", ".join(names[i : i + 2]) for i in range(0, len(names), 2)]  # a longer one pushes the panels apart
+        text = "not shown: " + ",\n".join(lines)
+        axes.text(0.02, 0.02, text, transform=axes.transAxes, fontsize=5.5, color="#777777")
 
 
 _LAST = "its last policy, deterministic"
