@@ -8,6 +8,7 @@ from scipy import stats
 
 from uavrl.evaluation.statistics import (
     Estimate,
+    decimals,
     difference,
     estimate_mean,
     excess_cost,
@@ -153,3 +154,11 @@ def test_probability_of_improvement_counts_pairs_of_runs() -> None:
     assert interval.mean == pytest.approx(np.mean([win for *_, win in wins]))
     assert 0 <= interval.low <= interval.mean <= interval.high <= 1
     assert probability_of_improvement(first + 10, second, seed=0) == (1, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("value", "significant", "places"),
+    [(-247.3, 3, 0), (-24.73, 3, 1), (0.9992, 3, 3), (1.0, 3, 2), (0.0123, 2, 3), (12345.0, 3, 0), (0.0, 3, 0)],
+)
+def test_decimals_show_as_many_significant_digits(value: float, significant: int, places: int) -> None:
+    assert decimals(value, significant) == places

@@ -11,7 +11,7 @@ where [w, z] is what the denoising chain returns. The guidance must reach the ac
 and for z alike: an argmax or a sampler without graph would leave nothing but behaviour cloning.
 
 Beyond the paper: `action_noise` on w in the backup and in L_g, `pinned_level`, `advantage_weight` and `greedy_choice`
-in the backup, the penalty over choices alone, the null action among a decision's candidates.
+in the backup, the penalty over choices alone; at a decision the null action among the candidates, and `choice_prior`.
 """
 
 from __future__ import annotations

@@ -34,7 +34,8 @@ class Train:
     ]
     """algorithm"""
     out: Path
-    """directory of the run: checkpoint, metrics.jsonl and, where asked for, tensorboard"""
+    """directory of the run: checkpoint, metrics.jsonl, scenario.toml where that of the data has no name, and, where
+    asked for, tensorboard"""
     data: str = "layouts"
     """layouts, fixed or realistic, a .parquet or .npz file, a .mapped directory, or the id of a Minari dataset"""
     size: int | None = None

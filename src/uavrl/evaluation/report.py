@@ -28,6 +28,7 @@ from uavrl.evaluation.rollouts import EvaluationSet, Flights, fly
 from uavrl.evaluation.statistics import (
     RESAMPLES,
     Estimate,
+    decimals,
     difference,
     estimate_mean,
     excess_cost,
@@ -385,6 +386,6 @@ def _cell(value: Mapping[str, float | None] | None, form: Shown, *, mark: bool =
         return "-"
     mean, low, high = (number * form.scale for number in numbers)
     largest = max(abs(mean), abs(low), abs(high))
-    decimals = max(0, form.digits - 1 - math.floor(math.log10(largest))) if largest > 0 else 0
+    places = decimals(largest, form.digits)
     clear = mark and (low > 0 or high < 0)
-    return f"{mean:.{decimals}f} [{low:.{decimals}f}, {high:.{decimals}f}]{' *' if clear else ''}"
+    return f"{mean:.{places}f} [{low:.{places}f}, {high:.{places}f}]{' *' if clear else ''}"

@@ -7,6 +7,7 @@ flights. Estimates from different resamplings are independent, and `combine` is 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -147,3 +148,8 @@ def probability_of_improvement(first: Float, second: Float, seed: int, resamples
     left, right = _drawn_runs(len(first), seed, resamples), _drawn_runs(len(second), seed + 1, resamples)
     replicates = each[left[:, :, None], right[:, None]].mean(axis=(1, 2))
     return Estimate(float(wins.mean()), replicates).interval()
+
+
+def decimals(value: float, significant: int) -> int:
+    """Decimal places with which a number shows as many significant digits, none of a larger whole; 0 for 0."""
+    return max(0, significant - 1 - math.floor(math.log10(abs(value)))) if value else 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import zlib
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from uavrl.evaluation.statistics import (
     Estimate,
     Interval,
+    decimals,
     difference,
     estimate_mean,
     excess_cost,
@@ -108,7 +108,7 @@ def table(rows: Sequence[Row], ours: str = OURS) -> list[list[str]]:
     ]  # fmt: skip
     lines, groups, compared = [header], grouped(rows), compare(rows, ours)
     least = min(abs(one.returned.mean) for one in compared)
-    digits = max(0, 2 - math.floor(math.log10(least))) if least > 0 else 0  # three significant ones of the best return
+    digits = decimals(least, 3)  # of the best return
     for one in compared:
         means = [_mean(scores(groups[one.name], metric)) for metric in metrics.values()]
         seeds = f"{one.seeds}" if one.seeds else ""

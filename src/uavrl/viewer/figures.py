@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from uavrl.errors import ConfigError
 from uavrl.evaluation.episode import Episode
+from uavrl.evaluation.statistics import decimals
 from uavrl.physics.age import age_integral_s2
 from uavrl.simulation.rendering import AGE_COLOURS, BLUE, INK, draw_area, numbered
 
@@ -208,9 +208,7 @@ def _bars(axes: Axes, rows: Sequence[tuple[float, float, float] | None], scale: 
 
 def _digits(value: float, scale: float) -> str:
     """Three significant digits, none beyond a thousandth of `scale`, no exponent."""
-    finest = max(0, 3 - math.floor(math.log10(scale)))
-    decimals = max(0, 2 - math.floor(math.log10(abs(value)))) if value else 0
-    text = f"{value:.{min(decimals, finest)}f}"
+    text = f"{value:.{min(decimals(value, 3), decimals(scale, 4))}f}"
     return text if float(text) else "0"
 
 
