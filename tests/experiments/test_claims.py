@@ -1,12 +1,14 @@
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.experiments.rows import cost_of, finished_figures, row
 from uavrl.experiments.claims import CLAIMS, FAILS, HOLDS, MISSING, OPEN, READING, Results, counted, judged, table
-from uavrl.experiments.paper import FIGURES
+from uavrl.experiments.paper import FIGURES, PROTOCOLS
 from uavrl.experiments.runner import Run
 
 
@@ -37,6 +39,22 @@ def changed(
 def test_there_are_twenty_claims_or_more_and_each_is_said_once() -> None:
     assert len(CLAIMS) >= 20
     assert len({claim.text + claim.where for claim in CLAIMS}) == len(CLAIMS)
+    assert all(claim.why for claim in CLAIMS)
+
+
+def test_every_file_that_a_reason_names_is_there() -> None:
+    root = Path(__file__).parents[2]
+    named = {path for claim in CLAIMS for path in re.findall(r"(?:docs|results)/[\w.-]*\w", claim.why)}
+    assert len(named) >= 4
+    assert all((root / path).exists() for path in named)
+
+
+def test_each_reading_has_its_line(figures: dict[str, list[dict[str, Any]]]) -> None:
+    (found,) = [finding for claim, finding in judged(Results(figures)) if claim.text.startswith("BCQ < IQL")]
+    lines = found.measured.split("\n")
+    assert [line.partition(":")[0] for line in lines] == [
+        PROTOCOLS[name].name for name in ("layouts", "published", "paper-objective", "realistic")
+    ]
 
 
 def test_a_world_as_the_paper_has_it(figures: dict[str, list[dict[str, Any]]]) -> None:

@@ -78,6 +78,7 @@ def test_the_page_holds_all_of_it_and_loads_nothing(episodes: int, tmp_path: Pat
     page = Page(text)
     assert page.open == []
     assert page.loaded == []
+    assert "(not measured yet)<br>comparison-paper: not computed" in text
     assert set(page.links) == page.anchors
     assert len(page.pictures) == 1
     assert page.pictures[0].startswith("data:image/png;base64,")

@@ -58,6 +58,10 @@ def test_the_table_has_a_line_a_policy_and_says_who_diverged() -> None:
     assert scores([rows[0]], "return").shape == (1, 12)
 
 
+def test_a_cell_of_two_lines_stays_one_line_of_the_table() -> None:
+    assert markdown([["a", "b"], ["1\n2", "3"]]).splitlines()[-1] == "| 1<br>2 | 3 |"
+
+
 def test_an_objective_a_second_is_shown_a_second() -> None:
     """Energy and age a step would tell who takes short steps."""
     rows = [row(run) for run in PLAN.comparison(PROTOCOLS["realistic"])]

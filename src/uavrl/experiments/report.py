@@ -179,7 +179,9 @@ def _table(lines: Sequence[Sequence[str]], kind: str = "numbers") -> str:
 
 def _cell(text: str) -> str:
     kinds = {claims.HOLDS: "holds", claims.FAILS: "fails", claims.READING: "reading"}
-    return f'<td class="{kinds[text]}">{escape(text)}</td>' if text in kinds else f"<td>{escape(text)}</td>"
+    kind = f' class="{kinds[text]}"' if text in kinds else ""
+    lines = escape(text).replace("\n", "<br>")
+    return f"<td{kind}>{lines}</td>"
 
 
 _PAGE = """<!DOCTYPE html>
@@ -199,6 +201,7 @@ _PAGE = """<!DOCTYPE html>
   table {{ border-collapse: collapse; font-size: 13px; margin: 12px 0; }}
   th, td {{ border-bottom: 1px solid #ddd; padding: 4px 8px; text-align: left; vertical-align: top; }}
   td:not(:first-child) {{ min-width: 4.5em; }} .claims td:nth-child(4) {{ min-width: 20em; }}
+  .claims td:nth-child(6) {{ min-width: 14em; }}
   .holds {{ color: #00684c; font-weight: bold; }} .fails {{ color: #a33c00; font-weight: bold; }}
   .reading {{ color: #6b5200; font-weight: bold; }}
   .made {{ color: #555; font-size: 13px; }}

@@ -130,8 +130,8 @@ def table(rows: Sequence[Row], ours: str = OURS) -> list[list[str]]:
 
 
 def markdown(lines: Sequence[Sequence[str]]) -> str:
-    """A Markdown table of a header and lines."""
-    header, *rest = lines
+    """A Markdown table of a header and lines; a line's break within a cell is kept."""
+    header, *rest = [[cell.replace("\n", "<br>") for cell in line] for line in lines]
     text = ["| " + " | ".join(header) + " |", "|---" * len(header) + "|"]
     return "\n".join([*text, *("| " + " | ".join(cells) + " |" for cells in rest)]) + "\n"
 
