@@ -99,7 +99,9 @@ def test_a_directory_of_another_run_is_left_alone(folder: Path, capsys: pytest.C
     assert collect("--out", "run", *SMALL) == 0
     assert collect("--out", "run", *SMALL, "--seed", "1") == 2
     assert collect("--out", "run", *SMALL, "--steps-per-update", "4") == 2
-    assert "holds a run of other settings" in capsys.readouterr().err
+    seed, steps = capsys.readouterr().err.splitlines()[-2:]
+    assert seed.endswith("holds a run of other settings, give another directory or the same ones: seed=0")
+    assert steps.endswith(": steps_per_update=8")
 
 
 def test_tensorboard_that_is_not_installed_is_one_line_before_anything_flies(

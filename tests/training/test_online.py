@@ -19,7 +19,7 @@ from uavrl.scenario import Scenario
 from uavrl.simulation.dynamics import advance
 from uavrl.simulation.state import Draws, FlightAction, SimState
 from uavrl.training.checkpoint import agent_tensors, load_checkpoint
-from uavrl.training.online import CollectConfig, OnlineLearner, same_run
+from uavrl.training.online import CollectConfig, OnlineLearner
 
 SCENARIO = small_scenario(devices=3, max_steps=6, fading="none")
 
@@ -197,13 +197,6 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_the_last_checkpoint_stays(t
     resumed = OnlineLearner.resume(tmp_path)
     assert resumed is not None
     assert 10 <= len(resumed.log) < 30
-
-
-def test_a_run_of_other_settings_is_told_apart(tmp_path: Path) -> None:
-    OnlineLearner(config(episodes=1)).run(tmp_path, quiet)
-    assert same_run(tmp_path, config(episodes=1))
-    assert not same_run(tmp_path, config(episodes=2))
-    assert not same_run(tmp_path, config(episodes=1, agent={"discount": 0.5}))
 
 
 def test_resume_refuses_what_it_cannot_go_on_with(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from uavrl.cli.settings import output_directory, pydantic_config, with_settings
+from uavrl.cli.settings import differing, output_directory, pydantic_config, with_settings
 from uavrl.errors import ConfigError
 from uavrl.scenario import load_scenario
 
@@ -47,7 +47,7 @@ class Collect:
         from uavrl.networks import NetworkConfig
         from uavrl.training.log import progress, require_tensorboard
         from uavrl.training.objective import for_objective
-        from uavrl.training.online import CollectConfig, OnlineLearner, same_run
+        from uavrl.training.online import CollectConfig, OnlineLearner
 
         if self.tensorboard:
             require_tensorboard()
@@ -67,8 +67,11 @@ class Collect:
         learner = OnlineLearner.resume(self.out)
         if learner is None:
             learner = OnlineLearner(config)
-        elif not same_run(self.out, config):
-            raise ConfigError(f"--out '{self.out}' holds a run of other settings; give another directory")
+        elif learner.config != config:
+            raise ConfigError(
+                f"--out '{self.out}' holds a run of other settings, give another directory or the same ones: "
+                + differing(learner.config, config)
+            )
         else:
             print(f"going on from step {len(learner.log):,}", file=sys.stderr)
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -54,6 +55,20 @@ def pydantic_config(kind: type[Config], /, **values: Any) -> Config:
         return kind(**values)
     except ValidationError as error:
         raise ConfigError(describe_validation(error, "setting")) from None
+
+
+def differing(began: BaseModel, asked: BaseModel) -> str:
+    """Each setting of `began` that is another one in `asked`, as `--set` names it."""
+    return ", ".join(_differing(began.model_dump(mode="json"), asked.model_dump(mode="json")))
+
+
+def _differing(began: dict[str, Any], asked: dict[str, Any], section: str = "") -> Iterator[str]:
+    for name, value in began.items():
+        other = asked.get(name)
+        if isinstance(value, dict) and isinstance(other, dict):
+            yield from _differing(value, other, f"{section}{name}.")
+        elif other != value:
+            yield f"{section.removeprefix('agent.')}{name}={json.dumps(value)}"
 
 
 def output_directory(path: Path) -> None:

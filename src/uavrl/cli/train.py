@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import tyro
 
-from uavrl.cli.settings import output_directory, pydantic_config, with_settings
+from uavrl.cli.settings import differing, output_directory, pydantic_config, with_settings
 from uavrl.errors import ConfigError, DivergenceError
 from uavrl.scenario import PRESETS, Scenario
 
@@ -154,7 +153,7 @@ class Train:
         for directory in begun:
             began, _ = began_as(load_checkpoint(directory / "checkpoint"), directory / "checkpoint")
             if began != places[directory]:
-                other = ", ".join(_differing(began.model_dump(), places[directory].model_dump()))
+                other = differing(began, places[directory])
                 raise ConfigError(
                     f"--resume: '{directory}' was started with other settings, give the same ones: {other}"
                 )
@@ -216,16 +215,6 @@ def at_once(config: TrainConfig, device: str) -> bool:
     from uavrl.agents.diffusion_sac import DiffusionSacConfig
 
     return device == "cuda" and config.compilation == "none" and isinstance(config.agent, DiffusionSacConfig)
-
-
-def _differing(began: dict[str, Any], asked: dict[str, Any], section: str = "") -> Iterator[str]:
-    """Each setting of `began` that is another one in `asked`, as name=value."""
-    for name, value in began.items():
-        other = asked.get(name)
-        if isinstance(value, dict) and isinstance(other, dict):
-            yield from _differing(value, other, f"{section}{name}.")
-        elif other != value:
-            yield f"{section.removeprefix('agent.')}{name}={json.dumps(value)}"  # as --set names it
 
 
 def trial_flights(transitions: Transitions, scenario: Scenario, episodes: int = 20) -> Evaluator:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -261,9 +260,3 @@ class OnlineLearner:
         learner.saved = len(learner.log)
         learner.observation = learner.environment.observation()
         return learner
-
-
-def same_run(directory: Path, config: CollectConfig) -> bool:
-    """Whether the checkpoint in `directory` was made by this configuration."""
-    document = load_checkpoint(directory / "checkpoint").document
-    return bool(document.get("collect") == json.loads(config.model_dump_json()))
