@@ -113,6 +113,13 @@ def test_an_age_beyond_the_largest_counts_as_the_largest(policy: Policy, percept
     assert (perceptron.decide(vector).displacement_m == expected.displacement_m).all()
 
 
+def test_a_packet_that_took_an_hour_is_no_mistaken_unit(policy: Policy) -> None:
+    """In Rayleigh fading a step's energy has no largest value, and the simulator says what it was."""
+    assert np.isfinite(policy.decide(changed("uav", (2,), 1e5)).displacement_m).all()
+    with pytest.raises(PolicyError, match=r"uav\[2\], energy_j = -1, allowed: 0 to"):
+        policy.decide(changed("uav", (2,), -1.0))
+
+
 @pytest.mark.parametrize(
     ("seen", "message"),
     [

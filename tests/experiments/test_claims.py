@@ -4,27 +4,28 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.experiments.rows import cost_of, finished_figures, row
 from uavrl.experiments.claims import CLAIMS, FAILS, HOLDS, MISSING, OPEN, READING, Results, counted, judged, table
-from uavrl.experiments.paper import FIGURES, PROTOCOLS
+from uavrl.experiments.paper import FIGURES, OURS, PROTOCOLS
 from uavrl.experiments.runner import Run
+
+Figures = dict[str, list[dict[str, Any]]]
 
 
 @pytest.fixture(scope="module")
-def figures() -> dict[str, list[dict[str, Any]]]:
+def figures() -> Figures:
     return finished_figures()
 
 
-def verdict(figures: dict[str, list[dict[str, Any]]], text: str) -> str:
+def verdict(figures: Figures, text: str) -> str:
     (found,) = [finding for claim, finding in judged(Results(figures)) if claim.text.startswith(text)]
     return found.verdict
 
 
-def changed(
-    figures: dict[str, list[dict[str, Any]]], names: tuple[str, ...], costs: dict[str, float]
-) -> dict[str, list[dict[str, Any]]]:
+def changed(figures: Figures, names: tuple[str, ...], costs: dict[str, float]) -> Figures:
     """The figures with other costs of some variants, by the first word that a variant begins with."""
 
     def again(one: dict[str, Any]) -> dict[str, Any]:
@@ -49,7 +50,7 @@ def test_every_file_that_a_reason_names_is_there() -> None:
     assert all((root / path).exists() for path in named)
 
 
-def test_each_reading_has_its_line(figures: dict[str, list[dict[str, Any]]]) -> None:
+def test_each_reading_has_its_line(figures: Figures) -> None:
     (found,) = [finding for claim, finding in judged(Results(figures)) if claim.text.startswith("BCQ < IQL")]
     lines = found.measured.split("\n")
     assert [line.partition(":")[0] for line in lines] == [
@@ -57,7 +58,7 @@ def test_each_reading_has_its_line(figures: dict[str, list[dict[str, Any]]]) -> 
     ]
 
 
-def test_a_world_as_the_paper_has_it(figures: dict[str, list[dict[str, Any]]]) -> None:
+def test_a_world_as_the_paper_has_it(figures: Figures) -> None:
     for text in (
         "Online SAC significantly",
         "Diffusion-SAC achieves the highest return",
@@ -78,7 +79,7 @@ def test_a_world_as_the_paper_has_it(figures: dict[str, list[dict[str, Any]]]) -
     assert verdict(figures, "More than 0.65 GB") == READING
 
 
-def test_a_verdict_turns_with_what_was_measured(figures: dict[str, list[dict[str, Any]]]) -> None:
+def test_a_verdict_turns_with_what_was_measured(figures: Figures) -> None:
     comparisons = ("comparison", "comparison-published", "comparison-paper", "comparison-realistic")
     worse = changed(figures, comparisons, {"CQL": 190.0})
     assert verdict(worse, "Diffusion-SAC achieves the highest return") == FAILS
@@ -96,17 +97,46 @@ def test_a_verdict_turns_with_what_was_measured(figures: dict[str, list[dict[str
     assert verdict(starved, "A severely biased") == HOLDS
 
 
-def test_a_figure_that_is_not_computed_leaves_its_claims_unsaid(figures: dict[str, list[dict[str, Any]]]) -> None:
+def test_a_figure_that_is_not_computed_leaves_its_claims_unsaid(figures: Figures) -> None:
     some = {"comparison": figures["comparison"]}
     assert verdict(some, "Online SAC significantly") == MISSING
     assert verdict(some, "Diffusion-SAC achieves the highest return") == HOLDS
     assert {finding.verdict for _, finding in judged(Results({}))} == {MISSING}
 
 
-def test_the_table_is_numbered_and_the_verdicts_counted(figures: dict[str, list[dict[str, Any]]]) -> None:
+def test_the_table_is_numbered_and_the_verdicts_counted(figures: Figures) -> None:
     found = judged(Results(figures))
     lines = table(found)
     assert [line[0] for line in lines[1:]] == [str(number) for number in range(1, len(CLAIMS) + 1)]
     assert all(len(line) == 6 and "|" not in "".join(line) for line in lines)
     assert sum(int(part.split()[0]) for part in counted(found).split(", ")) == len(CLAIMS)
     assert set(figures) == set(FIGURES)
+
+
+def scattered(figures: Figures, spreads: dict[str, float]) -> Figures:
+    """The comparison with three seeds of each algorithm, whose mean returns deviate as told."""
+    rows = []
+    for one in figures["comparison"]:
+        if one["variant"] not in spreads:
+            rows.append(one)
+        for seed in range(3) if one["variant"] in spreads and one["seed"] == 0 else ():
+            flown = one["scores"]["flown"]
+            moved = np.asarray(flown["return"]) + spreads[one["variant"]] * (seed - 1)
+            scores = {**one["scores"], "flown": {**flown, "return": moved.tolist()}}
+            rows.append({**one, "seed": seed, "scores": scores})
+    return {**figures, "comparison": rows}
+
+
+def test_a_spread_is_judged_by_the_ratio_of_two(figures: Figures) -> None:
+    others = {"CQL": 10.0, "IQL": 10.0, "BCQ": 10.0}
+    for spread, expected in ((0.5, HOLDS), (5.0, OPEN), (20.0, OPEN), (100.0, FAILS)):  # F(2, 2) has 39 at 97.5 %
+        assert verdict(scattered(figures, {OURS: spread} | others), "More stable") == expected, spread
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "expected"), [(102.0, 130.0, HOLDS), (120.0, 130.0, FAILS), (102.0, 101.0, FAILS)]
+)
+def test_whoever_falls_short_of_the_planner(figures: Figures, ours: float, theirs: float, expected: str) -> None:
+    costs = {"planner": 100.0, OURS: ours, "IQL": theirs, "CQL": theirs}
+    found = changed(figures, ("comparison",), costs)
+    assert verdict(found, "IQL and CQL fall short") == expected

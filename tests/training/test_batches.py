@@ -97,6 +97,7 @@ DURATION_S = np.array([0.5, 1.0, 2.0, 0.5, 0.25])
         (RewardConfig(transform="centred", clip=4.0, scale=3.0), False, [-4.0, 4.0, 3.0, 0.0, -3.0]),
         (RewardConfig(transform="centred", clip=None), True, REWARD),  # a shift would pay for ending, or for not ending
         (RewardConfig(transform="zscore", clip=None), False, (REWARD - REWARD.mean()) / REWARD.std()),
+        (RewardConfig(transform="zscore", clip=None), True, REWARD / REWARD.std()),
         (RewardConfig(transform="robust", clip=None), False, (REWARD + 3.0) / 10.0),  # 7, 2, 1, 0, 1 from the median
         (RewardConfig(transform="robust", clip=0.5, scale=5.0), False, [-0.5, 0.5, 0.5, 0.0, -0.5]),
         (RewardConfig(transform="robust", clip=None), True, REWARD / 10.0),
@@ -120,6 +121,14 @@ def test_a_level_per_second_is_the_same_for_any_cut_of_the_time_into_steps() -> 
     assert RewardTransform.fitted(REWARD, DURATION_S, config, True).level == 0.0
     held = seen._replace(clip=3.0)(torch.from_numpy(REWARD), torch.from_numpy(DURATION_S))  # -14, 10, 20, 0, -5
     np.testing.assert_allclose(held.numpy(), [-1.5, 3.0, 6.0, 0.0, -0.75])  # at most 3 a second
+
+
+def test_zscored_rewards_a_second_have_no_level_and_unit_deviation() -> None:
+    config = AgentConfig(discount_per="second", reward=RewardConfig(transform="zscore", clip=None))
+    seen = RewardTransform.fitted(REWARD, DURATION_S, config, False)
+    found = seen(torch.from_numpy(REWARD), torch.from_numpy(DURATION_S)).numpy()
+    assert (found / DURATION_S).mean() == pytest.approx(0.0, abs=1e-6)
+    assert found.std() == pytest.approx(1.0, rel=1e-5)
 
 
 @pytest.mark.parametrize("discount_per", ["step", "second"])

@@ -48,8 +48,9 @@ class Reproduce:
         from uavrl.training.log import progress
 
         store = self.out / f"{self.scale}.jsonl"
-        figures = wanted(SCALES[self.scale], self.figure or tuple(FIGURES))
-        table, runs = schedule(figures, finished(store), self.workers)
+        figures = wanted(SCALES[self.scale])
+        chosen = {name: figures[name] for name in self.figure or FIGURES}
+        table, runs = schedule(chosen, finished(store), self.workers)
         Console(width=None, highlight=False).print(table)
         if self.plan:
             return
@@ -57,4 +58,4 @@ class Reproduce:
         if not self.draw:
             with progress(f"reproduce {self.scale}", len(runs), "run") as report:
                 run_all(runs, measure, store, self.workers, report, self.cluster)
-        print("\n".join(write_results(figures, finished(store), self.out / self.scale, self.scale)))
+        print("\n".join(write_results(figures, finished(store), self.out / self.scale, self.scale, [*chosen])))

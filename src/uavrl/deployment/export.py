@@ -21,8 +21,7 @@ from uavrl.agents.base import Agent
 from uavrl.deployment.runtime import FORMAT, KEY
 from uavrl.errors import ConfigError
 from uavrl.networks import Observation
-from uavrl.physics.energy import hover_power_w
-from uavrl.scenario import Scenario, hover_reference_j
+from uavrl.scenario import Scenario
 from uavrl.simulation.observations import DEVICE_ENTRIES, UAV_ENTRIES
 
 OPSET = 18
@@ -123,7 +122,7 @@ def _inputs(scenario: Scenario, agent: Agent) -> dict[str, Any]:
     traffic, area = scenario.traffic, scenario.area
     extent_m = MARGIN * max(area.width_m, area.depth_m)
     place_m, age_s = (-extent_m, extent_m), (0.0, MARGIN * traffic.max_age_s)
-    energy_j = (0.0, MARGIN * hover_reference_j(scenario, hover_power_w(scenario.airframe)))
+    energy_j = (0.0, torch.finfo(torch.float32).max)  # a packet can take any time in fading
     mbit = (0.0, MARGIN * max(traffic.packet_bits_each) / 1e6)
 
     def described(entries: tuple[str, ...], shape: list[int | None], bounds: list[tuple[float, float]]) -> Any:

@@ -49,15 +49,25 @@ def finished_figures(figures: Mapping[str, Sequence[Run]], rows: Mapping[str, Ro
     return {name: done for name, done in found.items() if done}
 
 
-def write_results(figures: Mapping[str, Sequence[Run]], rows: Mapping[str, Row], out: Path, scale: str) -> list[str]:
-    """Draw every figure that has a training seed of each of its variants, with its table; says a line for each.
+def write_results(
+    figures: Mapping[str, Sequence[Run]], rows: Mapping[str, Row], out: Path, scale: str, chosen: Sequence[str] = ()
+) -> list[str]:
+    """Draw the figures that have a training seed of each of their variants, with their tables; says a line for each.
+
+    Args:
+        figures: every figure's runs, by which the claims are judged.
+        rows: finished runs by key.
+        out: directory, made where missing.
+        scale: its name.
+        chosen: names of the figures to draw; all of them where there is none.
 
     Raises:
         ConfigError: a file cannot be written.
     """
     out.mkdir(parents=True, exist_ok=True)
     done, said = finished_figures(figures, rows), []
-    for name, runs in figures.items():
+    for name in chosen or figures:
+        runs = figures[name]
         missing = sum(run.key not in rows for run in runs)
         left = f"{missing} of {len(runs)} runs are missing"
         if name not in done:

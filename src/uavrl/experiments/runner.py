@@ -23,7 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from uavrl import __version__
 from uavrl.benchmarks.timing import machine
 from uavrl.errors import ConfigError
-from uavrl.training.log import Reporter
+from uavrl.training.log import Reporter, read_metrics
 
 Scores = dict[str, Any]  # of one run, JSON
 Row = Mapping[str, Any]  # of the store: key, the run's fields, scores, seconds, machine
@@ -46,7 +46,7 @@ class Run(BaseModel):
 
     @property
     def key(self) -> str:
-        """Name of the run: changes with anything that its result depends on, the code's version included."""
+        """Name of the run: the hash of its whole configuration and of the package's version; of data, their name."""
         content = json.dumps([__version__, self.model_dump(mode="json", exclude={"variant"})], sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
@@ -60,9 +60,7 @@ def finished(store: Path) -> dict[str, dict[str, Any]]:
     """Rows of a store by their run's key; a last line that was cut short does not count."""
     if not store.exists():
         return {}
-    lines = store.read_text(encoding="utf-8").splitlines()
-    rows = [json.loads(line) for line in lines if line.endswith("}")]
-    return {row["key"]: row for row in rows}
+    return {row["key"]: row for row in read_metrics(store)}
 
 
 def grouped(rows: Sequence[Row]) -> dict[str, list[Row]]:

@@ -98,24 +98,23 @@ class RewardTransform(NamedTuple):
     ) -> RewardTransform:
         """For rewards and durations (n,) of logged steps.
 
-        "centred" and "robust" subtract the median; where an episode can terminate, a level would pay or punish ending
-        it, so it is 0.
+        "centred" and "robust" subtract the median, "zscore" the mean; where an episode can terminate, a level would
+        pay or punish ending it, so it is 0.
         """
         how, per_second = config.reward, config.discount_per == "second"
         values = np.asarray(reward, dtype=np.float64)
-        levels = values / duration_s if per_second else values
+        time = np.asarray(duration_s, dtype=np.float64) if per_second else np.ones_like(values)
+        middle = np.mean if how.transform == "zscore" else np.median
+        level, factor = float(middle(values / time)), how.scale
+        moved = values - level * time
         if how.transform == "zscore":
-            factor = how.scale / (float(values.std()) + 1e-6)
-            return cls(float(levels.mean()), factor, how.clip, per_second)
-        level, factor = float(np.median(levels)), how.scale
-        if how.transform == "robust":
-            apart = np.abs(values - level * duration_s if per_second else values - level)
-            spread = float(np.median(apart))
+            factor /= float(moved.std()) + 1e-6
+        elif how.transform == "robust":
+            spread = float(np.median(np.abs(moved)))
             if spread <= 1e-6 * np.abs(values).max():  # half of the rewards, or all, are equal
-                spread = float(apart.mean()) or 1.0
+                spread = float(np.abs(moved).mean()) or 1.0
             factor /= ROBUST_UNIT * spread
-        centred = how.transform in ("centred", "robust") and not terminates
-        return cls(level if centred else 0.0, factor, how.clip, per_second)
+        return cls(0.0 if terminates or how.transform == "none" else level, factor, how.clip, per_second)
 
     def __call__(self, reward: torch.Tensor, duration_s: torch.Tensor) -> torch.Tensor:
         """What the agent sees of rewards and durations (n,)."""
