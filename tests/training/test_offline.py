@@ -25,9 +25,9 @@ from uavrl.datasets import MappedTransitions, Transitions, load_builtin, save_ma
 from uavrl.errors import CheckpointError, ConfigError, DivergenceError
 from uavrl.scenario import load_scenario
 from uavrl.training.checkpoint import agent_tensors, load_checkpoint
-from uavrl.training.objective import for_objective
 from uavrl.training.offline import OfflineLearner, TrainConfig
 from uavrl.training.policy import AgentPolicy, load_policy
+from uavrl.training.scenario_settings import for_scenario
 
 SCENARIO = small_scenario()
 CHAIN = DiffusionConfig(steps=2)
@@ -374,7 +374,7 @@ def test_the_level_is_pinned_only_where_no_flight_can_end_by_itself(flown: Trans
 def test_a_reward_per_second_is_centred_by_the_second_where_no_battery_can_end_a_flight() -> None:
     rows = load_builtin("realistic", 500)
     scenario = load_scenario("realistic")
-    agent = for_objective(preset("diffusion_sac", "default"), scenario)
+    agent = for_scenario(preset("diffusion_sac", "default"), scenario)
     learner = OfflineLearner(TrainConfig(scenario=scenario, agent=agent, updates=2), rows)
     level = float(np.median(rows.reward / rows.duration_s))
     assert learner.seen.level == pytest.approx(level)

@@ -52,6 +52,14 @@ def test_a_loaded_policy_flies_as_the_one_that_was_saved(tmp_path: Path, name: s
     assert trained_scenario(tmp_path) == SCENARIO
 
 
+def test_a_displacement_keeps_its_metres_wherever_it_is_flown(tmp_path: Path) -> None:
+    far = SCENARIO.replace(max_displacement_m=50.0)
+    policy = saved(tmp_path, "gaussian_bc", "devices", far)
+    expected = policy.act(seen("devices"), generator=np.random.default_rng(1)).displacement_m
+    found = load_policy(tmp_path, SCENARIO).act(seen("devices"), generator=np.random.default_rng(1)).displacement_m
+    assert (found == expected).all()
+
+
 def test_a_perceptron_for_another_number_of_devices_is_refused_and_a_set_network_is_not(tmp_path: Path) -> None:
     larger = load_scenario("released", devices=7)
     saved(tmp_path / "mlp", "bc", "mlp")

@@ -46,14 +46,14 @@ class Collect:
         from uavrl.datasets import save_flat, write_minari
         from uavrl.networks import NetworkConfig
         from uavrl.training.log import progress, require_tensorboard
-        from uavrl.training.objective import for_objective
         from uavrl.training.online import CollectConfig, OnlineLearner
+        from uavrl.training.scenario_settings import for_scenario
 
         if self.tensorboard:
             require_tensorboard()
         width = 256 if self.network == "mlp" else 64
         scenario = load_scenario(self.scenario)
-        agent = for_objective(SacConfig(network=NetworkConfig(kind=self.network, width=width)), scenario, self.set)
+        agent = for_scenario(SacConfig(network=NetworkConfig(kind=self.network, width=width)), scenario, self.set)
         config = pydantic_config(
             CollectConfig,
             scenario=scenario,

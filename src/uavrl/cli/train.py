@@ -74,8 +74,8 @@ class Train:
         from uavrl.agents.registry import preset
         from uavrl.datasets import builtin_names, load_source, select
         from uavrl.training.log import require_tensorboard
-        from uavrl.training.objective import for_objective
         from uavrl.training.offline import PRESET_UPDATES, TrainConfig
+        from uavrl.training.scenario_settings import for_scenario
 
         if self.tensorboard:
             require_tensorboard()  # before anything that takes long
@@ -88,7 +88,7 @@ class Train:
         updates = PRESET_UPDATES[self.preset] if self.updates is None else self.updates
         agent = preset(self.agent, self.preset)
         if self.preset == "default":
-            agent = for_objective(agent, scenario, self.set)
+            agent = for_scenario(agent, scenario, self.set)
         config = pydantic_config(
             TrainConfig,
             scenario=scenario,

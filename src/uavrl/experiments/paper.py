@@ -15,7 +15,7 @@ from uavrl.agents.sac import SacConfig
 from uavrl.experiments.flights import Data, Setting
 from uavrl.experiments.runner import Run
 from uavrl.scenario import Scenario, load_scenario
-from uavrl.training.objective import for_objective
+from uavrl.training.scenario_settings import for_scenario
 
 OURS = "Diffusion-SAC"
 ALGORITHMS = {OURS: "diffusion_sac", "CQL": "cql", "IQL": "iql", "BCQ": "bcq", "BC": "bc"}
@@ -158,7 +158,7 @@ class Plan:
         every = CHEAPER.get(algorithm, {}) | dict(changes or {})
         agent = changed(preset(ALGORITHMS[algorithm], protocol.preset), every)
         if protocol.preset == "default":
-            agent = for_objective(agent, protocol.scenario)
+            agent = for_scenario(agent, protocol.scenario)
         settings = agent.model_dump(mode="json")
         rows = Data(**{"name": protocol.data, "size": self.size, **(data or {})})
         options = self._setting(protocol, rows, protocol.deterministic(algorithm), curve)

@@ -11,7 +11,7 @@ from rich.table import Table
 from uavrl.experiments.flights import Setting
 from uavrl.experiments.paper import FIGURES
 from uavrl.experiments.runner import Row, Run
-from uavrl.training.objective import STEP_S
+from uavrl.training.scenario_settings import STEP_S
 
 # Seconds of one core (AMD EPYC without AVX-512) an update, by agent and network, until a run of the kind has finished
 _UPDATE_S = {

@@ -89,7 +89,14 @@ AS_TRAINED = Decision()
 
 
 class AgentPolicy:
-    """Maps observations to displacements in metres and devices."""
+    """Maps observations to displacements in metres and devices.
+
+    Args:
+        name: what it is filed under.
+        agent: what decides.
+        scenario: where it learned; its longest move is the unit of the agent's displacements wherever it is flown.
+        decision: how it decides.
+    """
 
     def __init__(self, name: str, agent: Agent, scenario: Scenario, decision: Decision = AS_TRAINED) -> None:
         self.name = name
@@ -179,11 +186,9 @@ def load_policy(path: Path, scenario: Scenario, decision: Decision = AS_TRAINED)
         )
     decision.apply(agent)
     name = str(checkpoint.document.get("agent", place.name))
-    return AgentPolicy(name, agent, scenario, decision)
+    return AgentPolicy(name, agent, parse_scenario(checkpoint.document["scenario"]), decision)
 
 
 def trained_scenario(path: Path) -> Scenario:
     """The scenario that a checkpoint was trained in."""
-    path = Path(path)
-    place = checkpoint_in(path)
-    return parse_scenario(load_checkpoint(place).document["scenario"])
+    return parse_scenario(load_checkpoint(checkpoint_in(Path(path))).document["scenario"])

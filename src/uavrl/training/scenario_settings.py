@@ -1,4 +1,4 @@
-"""Settings that were found for the objective of `released`, for another one."""
+"""Settings that were found in `released`, for another scenario."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ TRIED = tuple(load_scenario(name).objective for name in ("released", "realistic"
 Config = TypeVar("Config", bound=AgentConfig)
 
 
-def for_objective(config: Config, scenario: Scenario, chosen: Sequence[str] = ()) -> Config:
-    """`config` as it is, or what corresponds to it under another objective than that of `released`.
+def for_scenario(config: Config, scenario: Scenario, chosen: Sequence[str] = ()) -> Config:
+    """`config` as it is, or what corresponds to it in a scenario of another objective, area or longest move.
+
+    A network over the set of devices counts distances in halves of the area's longer side and knows the longest move.
 
     Under a reward per second the discount is gamma^duration (a semi-Markov decision process) of as long a horizon for
     steps of `STEP_S`, at most that of `MOST_DISCOUNT`, and rewards, which shrink with the step, are scaled up to what a
@@ -30,7 +32,7 @@ def for_objective(config: Config, scenario: Scenario, chosen: Sequence[str] = ()
 
     Args:
         config: a preset.
-        scenario: whose objective counts.
+        scenario: what is learned for.
         chosen: settings, name=value, to be made by hand: with discount_per among them nothing is made per second, with
             reward.transform the scale does not come from the log.
     """
@@ -53,4 +55,10 @@ def for_objective(config: Config, scenario: Scenario, chosen: Sequence[str] = ()
             changes |= {"pinned_level": False, "advantage_weight": ADVANTAGE_WEIGHT, "choice_prior": 0.0}
     if reward != config.reward:
         changes["reward"] = reward
+    area, network = scenario.area, config.network
+    if network.kind == "devices":
+        sizes = {"scale_m": 0.5 * max(area.width_m, area.depth_m), "reach_m": scenario.airframe.max_displacement_m}
+        network = network.model_copy(update=sizes)
+    if network != config.network:
+        changes["network"] = network
     return config.model_copy(update=changes) if changes else config
