@@ -25,6 +25,24 @@ PACKAGE = ROOT / "src" / "uavrl"
 INSTALLED_AS = {"PIL": "pillow", "yaml": "pyyaml", "h5py": "minari"}  # h5py is minari[hdf5]
 
 
+def imported() -> dict[str, str]:
+    """Modules of others that the package imports, with one of the files that do."""
+    used: dict[str, str] = {}
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = []
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                names = [node.module]
+            used |= {name.partition(".")[0]: path.name for name in names}
+    return {name: file for name, file in used.items() if name not in sys.stdlib_module_names | {"uavrl"}}
+
+
+def installed_as(module: str) -> str:
+    return canonicalize_name(INSTALLED_AS.get(module, module))
+
+
 @pytest.fixture(scope="module")
 def project() -> dict[str, Any]:
     project: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -90,18 +108,16 @@ def test_the_command_is_installed() -> None:
 
 def test_every_import_is_declared(project: dict[str, Any]) -> None:
     declared = {canonicalize_name(requirement.name) for requirement in requirements(project)}
-    used: dict[str, str] = {}
-    for path in PACKAGE.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            names = []
-            if isinstance(node, ast.Import):
-                names = [alias.name for alias in node.names]
-            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-                names = [node.module]
-            used |= {name.partition(".")[0]: path.name for name in names}
-    third_party = {name: file for name, file in used.items() if name not in sys.stdlib_module_names | {"uavrl"}}
-    missing = {n: f for n, f in third_party.items() if canonicalize_name(INSTALLED_AS.get(n, n)) not in declared}
+    missing = {name: file for name, file in imported().items() if installed_as(name) not in declared}
     assert not missing, f"not in pyproject.toml: {missing}"
+
+
+def test_every_requirement_of_a_user_is_imported(project: dict[str, Any]) -> None:
+    extras = {name: lines for name, lines in project["optional-dependencies"].items() if name != "dev"}
+    declared = {Requirement(line).name for lines in (project["dependencies"], *extras.values()) for line in lines}
+    wanted_by_others = {"pillow", "tensorboard", "onnx"}  # by minari and torch, which do not declare them
+    idle = {canonicalize_name(name) for name in declared} - wanted_by_others - {*map(installed_as, imported())}
+    assert not idle, f"in pyproject.toml, imported nowhere: {idle}"
 
 
 def test_every_requirement_is_pinned_within_its_bounds(project: dict[str, Any]) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from uavrl.cli import main
 from uavrl.cli.demo import typical_flight
 
 
@@ -37,6 +38,27 @@ def flights(ends_m: list[float], steps: list[int]) -> Any:
 def test_the_flight_shown_ends_as_far_from_its_start_as_the_median() -> None:
     assert typical_flight(flights([5.0, 300.0, 90.0], [3, 2, 1])) == 2
     assert typical_flight(flights([5.0, 300.0, -90.0, 100.0], [3, 2, 1, 2])) == 3
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--updates", "0"], "field 'updates' = 0: input should be greater than or equal to 1"),
+        (["--seed", "-1"], "field 'seed' = -1"),
+        (["--episodes", "1"], "--episodes 1, allowed: 2 or more"),
+        (["--out", "file"], "file"),
+    ],
+)
+def test_wrong_words_are_refused_before_anything_is_flown(
+    words: list[str], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    monkeypatch.setattr("uavrl.datasets.load_builtin", lambda _: pytest.fail("begun"))
+    assert main(["demo", *words]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("uavrl: error: ")
+    assert told in line
 
 
 @pytest.mark.slow  # learns, and the planner flies: a minute

@@ -136,9 +136,21 @@ def test_a_long_run_is_logged_every_200_updates(folder: Path, monkeypatch: pytes
     seen = []
     monkeypatch.setattr(OfflineLearner, "run", lambda self, out, *_, **__: seen.append(self.config.log_every))
     words = ["bc", "--out", "run", "--data", "log.parquet", *SMALL]
-    with pytest.raises(FileNotFoundError):  # of metrics.jsonl: nothing ran
-        train(*words)
+    assert train(*words) == 2  # there is no metrics.jsonl: nothing ran
     assert seen == [200]
+
+
+def test_a_full_disk_is_told_in_one_line(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from uavrl.training.offline import OfflineLearner
+
+    def full(self: OfflineLearner, out: Path, *_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device", str(out / "checkpoint"))
+
+    monkeypatch.setattr(OfflineLearner, "run", full)
+    assert train("bc", "--out", "run", "--data", "log.parquet", *SMALL) == 2
+    assert capsys.readouterr().err == "uavrl: error: 'run/checkpoint': No space left on device\n"
 
 
 def test_tensorboard_that_is_not_installed_is_one_line_before_anything_runs(

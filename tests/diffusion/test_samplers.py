@@ -22,7 +22,6 @@ from uavrl.diffusion import (
     denoising_loss,
     dpm_solver_pp_2m,
     make_schedule,
-    one_step,
     predict_x0,
     schedule_from_beta,
     straight_through_clamp,
@@ -389,7 +388,7 @@ def test_clipped_samples_end_in_the_box(
 @pytest.mark.parametrize("clip", [False, True])
 @given(st.sampled_from(NAMES), st.integers(1, 30), st.integers(0, 2**31))
 def test_single_samples_against_one_at_a_time(clip: bool, name: ScheduleName, steps: int, seed: int) -> None:
-    """add_noise, predict_x0, one_step and denoising_loss: each sample has its own step."""
+    """add_noise, predict_x0 and denoising_loss: each sample has its own step."""
     schedule = make_schedule(name, steps)
     denoise, denoise_np = network(steps)
     _, alpha_bar = constants(reference_beta(name, steps))
@@ -397,7 +396,7 @@ def test_single_samples_against_one_at_a_time(clip: bool, name: ScheduleName, st
     x0, noise, step = rng.uniform(-1, 1, (6, 3)), rng.normal(size=(6, 3)), rng.integers(1, steps + 1, 6)
     args = schedule, torch.from_numpy(x0), torch.from_numpy(step), torch.from_numpy(noise)
     noised = add_noise(*args)
-    estimate = one_step(denoise, *args, clip_x0=clip)
+    estimate = predict_x0(schedule, noised, args[2], denoise(noised, args[2]), clip)
     loss = denoising_loss(denoise, *args)
     direct = predict_x0(schedule, noised, args[2], args[3], clip)
     assert loss.shape == (6, 3)
@@ -413,11 +412,12 @@ def test_single_samples_against_one_at_a_time(clip: bool, name: ScheduleName, st
         np.testing.assert_allclose(direct[n].numpy(), x0[n], atol=1e-6)  # the true noise gives the data back
 
 
-def test_one_step_passes_its_gradient_when_clipped() -> None:
+def test_a_clipped_estimate_passes_its_gradient_inwards() -> None:
     schedule = make_schedule("vp", 5)
     weight = torch.tensor(50.0, requires_grad=True)
     step = torch.tensor([1, 5])
-    out = one_step(lambda x, step: weight * x, schedule, torch.ones(2, 3), step, torch.ones(2, 3), clip_x0=True)
+    x = add_noise(schedule, torch.ones(2, 3), step, torch.ones(2, 3))
+    out = predict_x0(schedule, x, step, weight * x, True)
     assert bool((out == -1).all())
     (inwards,) = torch.autograd.grad(-out.sum(), weight, retain_graph=True)
     assert inwards.item() > 0
@@ -446,7 +446,8 @@ def test_dtype_follows_the_inputs(sampler: Sampler, dtype: torch.dtype) -> None:
     noise = torch.ones(3, 2, 3, dtype=dtype)
     assert sampler(denoise, schedule, start, noise).dtype == dtype
     assert seen == {(dtype, 1), (dtype, 2), (dtype, 3)}
-    assert one_step(denoise, schedule, start, torch.tensor([1, 3]), noise[0], clip_x0=True).dtype == dtype
+    assert add_noise(schedule, start, torch.tensor([1, 3]), noise[0]).dtype == dtype
+    assert predict_x0(schedule, start, torch.tensor([1, 3]), noise[0], True).dtype == dtype
 
 
 @pytest.mark.parametrize("sampler", [ddpm_as("beta", clip_x0=True), ddim_as(0.5, gradient_steps=2), dpm_as()])
@@ -459,7 +460,7 @@ def test_nothing_waits_for_the_device(sampler: Sampler) -> None:
         return x / torch.as_tensor(step, device="meta").reshape(-1, 1)
 
     assert sampler(denoise, schedule, start, torch.empty(3, 2, 3, device="meta")).shape == (2, 3)
-    assert one_step(denoise, schedule, start, step, start, clip_x0=True).shape == (2, 3)
+    assert predict_x0(schedule, start, step, denoise(start, step), True).shape == (2, 3)
     assert denoising_loss(denoise, schedule, start, step, start).shape == (2, 3)
 
 

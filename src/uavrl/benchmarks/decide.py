@@ -92,9 +92,8 @@ def measure(name: str, seconds: float, scenario: Scenario | None = None) -> dict
     """`Exported.figures` of one of `CASES`, untrained, which changes no time."""
     scenario = load_scenario("released") if scenario is None else scenario
     config = settings(CASES[name])
-    state = torch.random.get_rng_state()
-    agent = make_agent(spaces_of(scenario, config.network.kind), config)
-    torch.random.set_rng_state(state)
+    with torch.random.fork_rng(devices=[]):
+        agent = make_agent(spaces_of(scenario, config.network.kind), config)
     logged, _ = load_builtin("layouts").observations(OBSERVATION_OF[config.network.kind], scenario)
     fit_normalisers(agent.networks, to_tensors(logged))
     exported = Exported(agent, scenario)

@@ -69,6 +69,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter's last flush fails too
         return 141
+    except OSError as error:  # a full disk, a directory that may not be written, a file where a directory is meant
+        place = f"'{error.filename}': " if error.filename is not None else ""
+        print(f"uavrl: error: {place}{error.strerror or error}", file=sys.stderr)
+        return 2
     return 0
 
 

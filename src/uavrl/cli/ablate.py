@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import tyro
 
-from uavrl.cli.settings import output_directory
+from uavrl.cli.settings import Many, output_directory
 from uavrl.errors import ConfigError
-
-Many = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
 
 @dataclass(frozen=True)
@@ -30,6 +28,7 @@ class Ablate:
     """processes at a time, each on one core"""
 
     def run(self) -> None:
+        from uavrl.evaluation.report import write_text
         from uavrl.experiments.ablation import VARIANTS, measure, runs, table
         from uavrl.experiments.runner import finished, run_all
         from uavrl.training.log import progress
@@ -48,6 +47,6 @@ class Ablate:
         with progress(f"ablate {self.problem}", len(wanted), "run") as report:
             rows = run_all(wanted, measure, store, self.workers, report)
         text = table(rows)
-        (self.out / f"{self.problem}.md").write_text(text, encoding="utf-8")
+        write_text(self.out / f"{self.problem}.md", text)
         print(text, end="")
         print(f"{sum(row['seconds'] for row in rows) / 3600:.1f} core-hours in all; rows and table in {self.out}")

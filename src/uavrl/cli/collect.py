@@ -5,15 +5,11 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-import tyro
-
-from uavrl.cli.settings import differing, output_directory, pydantic_config, with_settings
+from uavrl.cli.settings import Many, differing, output_directory, pydantic_config, with_settings
 from uavrl.errors import ConfigError
 from uavrl.scenario import load_scenario
-
-Many = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from uavrl.cli.settings import pydantic_config
+from uavrl.cli.settings import output_directory, pydantic_config
 from uavrl.errors import ConfigError
 
 if TYPE_CHECKING:
     from uavrl.evaluation.report import Judgement
     from uavrl.evaluation.rollouts import EvaluationSet, Flights
+    from uavrl.training.offline import TrainConfig
 
 HEURISTICS = ("random_walk", "saver", "tdm", "max_age", "index", "hover", "planner")
 DATA = "layouts"
@@ -45,6 +46,8 @@ class Demo:
 
         if self.episodes < 2:
             raise ConfigError(f"--episodes {self.episodes}, allowed: 2 or more (an interval needs them)")
+        configs = {agent: _config(agent, self.updates, self.seed) for agent in ("bc", "diffusion_sac")}
+        output_directory(self.out)
         started = time.monotonic()
         transitions = load_builtin(DATA)
         scenario = load_scenario("released")
@@ -57,10 +60,10 @@ class Demo:
         # a fresh interpreter: torch's threads do not survive a fork
         context = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(1, mp_context=context, initializer=_single_thread) as side:
-            bc = side.submit(_train, "bc", self.out / "bc", self.updates, self.seed, False)
+            bc = side.submit(_train, configs["bc"], self.out / "bc", False)
             heuristics = {name: side.submit(_fly_heuristic, name, environments) for name in HEURISTICS}
             _single_thread()
-            policy = _train("diffusion_sac", self.out / "policy", self.updates, self.seed, True)
+            policy = _train(configs["diffusion_sac"], self.out / "policy", True)
             # each learned policy in its better form: the guided chain without noise, imitation with it
             flown = {"diffusion_sac": fly(policy, environments, name="diffusion_sac", deterministic=True)}
             flown["bc"] = fly(bc.result(), environments, name="bc")
@@ -88,20 +91,19 @@ def _single_thread() -> None:
     torch.set_num_threads(1)
 
 
-def _train(agent: str, out: Path, updates: int, seed: int, visible: bool) -> Any:
-    """Train afresh in `out` and return the policy; an earlier demo there is replaced when this one is saved."""
-    from uavrl.agents.registry import preset
-    from uavrl.cli.train import trial_flights
-    from uavrl.datasets import load_builtin
-    from uavrl.scenario import load_scenario
-    from uavrl.training.log import progress
-    from uavrl.training.offline import OfflineLearner, TrainConfig
+def _config(agent: str, updates: int, seed: int) -> TrainConfig:
+    """How the demo trains an agent.
 
-    transitions, scenario = load_builtin(DATA), load_scenario("released")
-    (out / "metrics.jsonl").unlink(missing_ok=True)
-    config = pydantic_config(
+    Raises:
+        ConfigError: updates or a seed that is not allowed.
+    """
+    from uavrl.agents.registry import preset
+    from uavrl.scenario import load_scenario
+    from uavrl.training.offline import TrainConfig
+
+    return pydantic_config(
         TrainConfig,
-        scenario=scenario,
+        scenario=load_scenario("released"),
         agent=preset(agent, "default"),
         updates=updates,
         seed=seed,
@@ -109,10 +111,21 @@ def _train(agent: str, out: Path, updates: int, seed: int, visible: bool) -> Any
         evaluate_every=max(1, updates // 4),
         log_every=max(1, min(50, updates // 10)),
     )
+
+
+def _train(config: TrainConfig, out: Path, visible: bool) -> Any:
+    """Train afresh in `out` and return the policy; an earlier demo there is replaced when this one is saved."""
+    from uavrl.cli.train import trial_flights
+    from uavrl.datasets import load_builtin
+    from uavrl.training.log import progress
+    from uavrl.training.offline import OfflineLearner
+
+    transitions = load_builtin(DATA)
+    (out / "metrics.jsonl").unlink(missing_ok=True)
     learner = OfflineLearner(config, transitions)
     stream = sys.stderr if visible else open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # closed with its process
-    with progress(f"train {agent}", updates, "update", stream) as report:
-        return learner.run(out, report, trial_flights(transitions, scenario))
+    with progress(f"train {config.agent.name}", config.updates, "update", stream) as report:
+        return learner.run(out, report, trial_flights(transitions, config.scenario))
 
 
 def _fly_heuristic(name: str, environments: EvaluationSet) -> Flights:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import tyro
 
-from uavrl.cli.settings import output_directory, pydantic_config, with_settings
+from uavrl.cli.settings import Many, output_directory, pydantic_config, with_settings
 from uavrl.errors import ConfigError
-
-Many = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
 UPDATES = 3_000
 

@@ -7,16 +7,13 @@ import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
-import tyro
 from rich.console import Console
 
 from uavrl.cli.policies import resolve_all
+from uavrl.cli.settings import Many
 from uavrl.errors import ConfigError
 from uavrl.scenario import load_scenario
-
-Many = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
 
 @dataclass(frozen=True)

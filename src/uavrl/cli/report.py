@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
-
-import tyro
+from typing import Literal
 
 from uavrl.cli.evaluate import check_writable
 from uavrl.cli.policies import resolve_all
+from uavrl.cli.settings import Many
 from uavrl.errors import ConfigError
-
-Many = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
 
 @dataclass(frozen=True)

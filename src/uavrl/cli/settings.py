@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
+import tyro
 from pydantic import BaseModel, ValidationError
 
 from uavrl.errors import ConfigError
 from uavrl.scenario import describe_validation
 
 Config = TypeVar("Config", bound=BaseModel)
+Many = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]  # an option that is repeated for more
 
 
 def with_settings(config: Config, settings: tuple[str, ...]) -> Config:

@@ -6,12 +6,12 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import tyro
 
-from uavrl.cli.settings import differing, output_directory, pydantic_config, with_settings
+from uavrl.cli.settings import Many, differing, output_directory, pydantic_config, with_settings
 from uavrl.errors import ConfigError, DivergenceError
 from uavrl.scenario import PRESETS, Scenario
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from uavrl.datasets import Transitions
     from uavrl.training.offline import Evaluator, OfflineLearner, TrainConfig
 
-Many = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
 LOG_EVERY = 200  # updates between rows of the log, at most
 

@@ -9,7 +9,6 @@ from uavrl.diffusion.samplers import (
     ddpm,
     denoising_loss,
     dpm_solver_pp_2m,
-    one_step,
     predict_x0,
     straight_through_clamp,
 )
@@ -27,7 +26,6 @@ __all__ = [
     "denoising_loss",
     "dpm_solver_pp_2m",
     "make_schedule",
-    "one_step",
     "predict_x0",
     "schedule_from_beta",
     "straight_through_clamp",

@@ -166,17 +166,6 @@ def dpm_solver_pp_2m(denoiser: ChainDenoiser, schedule: Schedule, start: Tensor,
     return _reverse(denoiser, schedule, start, update, clip_x0, None)
 
 
-def one_step(
-    denoiser: Denoiser, schedule: Schedule, x0: Tensor, step: Tensor, noise: Tensor, *, clip_x0: bool
-) -> Tensor:
-    """Action approximation of EDP (Kang et al. 2023): x_0 (N, D) as one pass predicts it from x0 (N, D) noised.
-
-    step (N,) int64 in 1..M and noise (N, D) ~ N(0, I). Its gradient costs one pass of the network instead of M.
-    """
-    x = add_noise(schedule, x0, step, noise)
-    return predict_x0(schedule, x, step, denoiser(x, step), clip_x0)
-
-
 def denoising_loss(denoiser: Denoiser, schedule: Schedule, x0: Tensor, step: Tensor, noise: Tensor) -> Tensor:
     """Squared error (N, D) of the predicted noise, eq. (diffRL_loss), unreduced: the caller weights the entries.
 

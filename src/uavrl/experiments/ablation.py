@@ -105,8 +105,9 @@ def measure(run: Run, directory: Path) -> Scores:
 def measure_bandit(run: Run, config: DiffusionSacConfig) -> dict[str, float]:
     """See `HybridBandit.score`."""
     bandit = HybridBandit.draw(run.seed)
-    torch.manual_seed(run.seed)
-    agent = DiffusionSac(SPACES, config)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(run.seed)
+        agent = DiffusionSac(SPACES, config)
     fit_bandit(agent, bandit, run.updates, run.seed)
     found = bandit.score(samples(agent, run.seed))
     for count in run.options.get("candidates", ()):

@@ -14,6 +14,7 @@ from plotly.subplots import make_subplots
 
 from uavrl.errors import ConfigError
 from uavrl.evaluation.episode import Episode
+from uavrl.evaluation.report import write_text
 from uavrl.physics.age import age_integral_s2
 from uavrl.simulation.rendering import AGE_COLOURS, BLUE, INK, MARGIN, VERMILION, numbered
 
@@ -392,8 +393,4 @@ def write_page(episode: Episode, path: Path, frames: int = FRAMES) -> None:
     Raises:
         ConfigError: as `episode_page`, or the file cannot be written.
     """
-    page = episode_page(episode, frames)
-    try:
-        path.write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"file '{path}' cannot be written: {error.strerror}") from None
+    write_text(path, episode_page(episode, frames))
