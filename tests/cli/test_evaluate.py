@@ -49,6 +49,15 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+def test_another_scenario_than_a_policy_learned_in_is_told(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["evaluate", "--scenario", "short.toml", "--episodes", "2", "--deterministic"]
+    assert main([*words, "--policy", "tdm", "--policy", "pretrained:realistic"]) == 0
+    told = "pretrained:realistic learned in 'realistic', it is flown in 'released'"
+    assert told in capsys.readouterr().err
+    assert main([*words, "--policy", "pretrained:layouts@choice_prior=0"]) == 0
+    assert "learned in" not in capsys.readouterr().err
+
+
 def test_a_report_is_written_and_shown(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = "evaluate --policy tdm --policy birds:Hummingbird --policy tdm --scenario short.toml --episodes 3"
     assert main([*words.split(), "--baseline", "tdm", "--json", "out.json", "--markdown", "out.md"]) == 0

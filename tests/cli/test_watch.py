@@ -5,8 +5,10 @@ from pathlib import Path
 import pytest
 
 from uavrl.cli import main
-from uavrl.evaluation.rollouts import evaluation_set, fly
+from uavrl.errors import ConfigError
+from uavrl.evaluation.rollouts import EvaluationSet, evaluation_set, fly
 from uavrl.policies import make_policy
+from uavrl.policies.base import Policy
 
 
 def test_the_flight_is_the_one_that_evaluate_flies(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -16,6 +18,22 @@ def test_the_flight_is_the_one_that_evaluate_flies(tmp_path: Path, capsys: pytes
     total = f"return {flights.episode(2).total_reward:.4g}"
     assert total in capsys.readouterr().out
     assert f"tdm: {total}" in page.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("words", "name"), [(["tdm"], "released"), (["pretrained:realistic"], "realistic"),
+                        (["pretrained:realistic", "--scenario", "released"], "released")]
+)  # fmt: skip
+def test_a_policy_is_watched_where_it_learned(words: list[str], name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[str] = []
+
+    def fly(policy: Policy, environments: EvaluationSet, **_: object) -> None:
+        seen.append(environments.scenario.name)
+        raise ConfigError("far enough")
+
+    monkeypatch.setattr("uavrl.evaluation.rollouts.fly", fly)
+    assert main(["watch", *words]) == 2
+    assert seen == [name]
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from uavrl.evaluation.report import (
     Judgement,
     judge,
     markdown_table,
+    notes,
     returns_of_duty,
     rich_table,
     write_json,
@@ -169,6 +170,7 @@ def test_idling_is_said_to_pay_where_it_does() -> None:
     settled = 400 * 0.5 * (4.5 * 0.1335 + 0.1135 * 9.797 / 1000)
     assert always == pytest.approx(-settled, rel=0.03)
     notes = judge({"tdm": Scripted((1,))}, evaluation_set("paper", "random", 1)).report["notes"]
+    assert not any("fresher" in note for note in notes)  # a lucky draw of Rayleigh fading is
     assert any("pays for serving rarely" in note for note in notes)
 
 
@@ -191,3 +193,12 @@ def test_who_takes_part_is_checked() -> None:
         judge({"tdm": Scripted((1,))}, environments, baselines=["planner"])
     with pytest.raises(ConfigError, match="policies is empty"):
         judge({}, environments)
+
+
+def test_lower_bounds_are_told_where_service_times_have_them() -> None:
+    calm = load_scenario("released", fading="none")
+    told = judge({"tdm": Scripted((1,))}, evaluation_set(calm, "random", 1)).report["notes"]
+    expected = "its age is at least 0.558 s in the mean over 400 steps or 0.640 s in the mean over 400 s."
+    assert any(note.endswith(expected) for note in told)
+    charged = calm.replace(decision_time="measured")
+    assert not any("fresher" in note for note in notes(charged, {}))

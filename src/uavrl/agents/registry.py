@@ -144,6 +144,11 @@ def changed(config: Config, changes: Mapping[str, Any]) -> Config:
     return type(config).model_validate(data)
 
 
+def acts_best_deterministically(config: AgentConfig) -> bool:
+    """Whether its deterministic action is to be flown rather than a sample, as its class says."""
+    return bool(getattr(AGENTS[type(config)], "acts_best_deterministically", False))
+
+
 def make_agent(spaces: Spaces, config: AgentConfig) -> Agent:
     """An untrained agent; weights come from torch's global generator, which the caller seeds.
 

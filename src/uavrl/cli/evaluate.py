@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from uavrl.cli.policies import resolve_all
+from uavrl.cli.policies import learned_in, resolve_all
 from uavrl.cli.settings import Many
 from uavrl.errors import ConfigError
 from uavrl.scenario import load_scenario
@@ -59,6 +59,10 @@ class Evaluate:
             scenario, self.layouts, self.episodes, seed=self.seed, fading_seeds=self.fading_seeds
         )
         policies = resolve_all(self.policy, scenario)
+        for spec in self.policy:
+            learned = learned_in(spec)
+            if learned is not None and learned.name != scenario.name:
+                print(f"{spec} learned in '{learned.name}', it is flown in '{scenario.name}'", file=sys.stderr)
         data = None
         if self.data is not None:
             from uavrl.datasets.sources import load_source

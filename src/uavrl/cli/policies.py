@@ -61,6 +61,16 @@ def resolve(spec: str, scenario: Scenario) -> Policy:
     )
 
 
+def learned_in(spec: str) -> Scenario | None:
+    """The scenario that a checkpoint was trained in; None for any other policy."""
+    place, _ = _split(spec)
+    if spec not in POLICIES and (place.startswith("pretrained:") or Path(place).is_dir()):
+        from uavrl.training.policy import trained_scenario  # here: torch is slow to import
+
+        return trained_scenario(Path(place))
+    return None
+
+
 def checkpoint_and_decision(spec: str) -> tuple[Path, Decision]:
     """`runs/mine`, `pretrained:NAME`, or either followed by how it is to decide: `runs/mine@solver=dpm,steps=3`.
 

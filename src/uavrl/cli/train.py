@@ -70,7 +70,7 @@ class Train:
     """write the log for TensorBoard as well; needs the extra 'tracking'"""
 
     def run(self) -> None:
-        from uavrl.agents.registry import preset
+        from uavrl.agents.registry import acts_best_deterministically, preset
         from uavrl.datasets import builtin_names, load_source, select
         from uavrl.training.log import require_tensorboard
         from uavrl.training.offline import PRESET_UPDATES, TrainConfig
@@ -113,7 +113,8 @@ class Train:
             raise DivergenceError("; ".join(f"{name}: {error}" for name, error in diverged.items()))
         print(f"{updates:,} updates on {len(transitions):,} transitions; policy in {', '.join(map(str, places))}")
         judged = " ".join(f"--policy {directory}" for directory in places)
-        print(f"next: uavrl evaluate --policy tdm {judged} --scenario {self._named(scenario, next(iter(places)))}")
+        how = " --deterministic" if acts_best_deterministically(config.agent) else ""
+        print(f"next: uavrl evaluate --policy tdm {judged} --scenario {self._named(scenario, next(iter(places)))}{how}")
 
     def _named(self, scenario: Scenario, directory: Path) -> str:
         """What `--scenario` takes to mean it; a file in `directory` where it has no name."""

@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 
 from uavrl.cli.evaluate import check_writable
-from uavrl.cli.policies import resolve
+from uavrl.cli.policies import learned_in, resolve
 from uavrl.errors import ConfigError
 from uavrl.scenario import load_scenario
 
@@ -20,8 +20,8 @@ class Watch:
     policy: tyro.conf.Positional[str]
     """a heuristic's name, a checkpoint's directory or pretrained:NAME (@solver=dpm,steps=3 behind it: decide so), an
     .onnx file, or your own module:Class"""
-    scenario: str = "released"
-    """a preset (paper, released, realistic) or a TOML file"""
+    scenario: str | None = None
+    """a preset (paper, released, realistic) or a TOML file; by default a checkpoint's own, or released"""
     layouts: str = "random"
     """fixed (one layout), random (one an episode), or a JSON file with a list of K x 2 layouts in metres"""
     episode: int = 0
@@ -41,7 +41,8 @@ class Watch:
         if self.frames < 2:
             raise ConfigError(f"--frames {self.frames}, allowed: 2 or more")
         check_writable(self.out)
-        scenario = load_scenario(self.scenario)
+        scenario = None if self.scenario is not None else learned_in(self.policy)
+        scenario = scenario or load_scenario(self.scenario or "released")
         policy = resolve(self.policy, scenario)
         from uavrl.evaluation.rollouts import evaluation_set, fly
         from uavrl.viewer.page import write_page

@@ -23,6 +23,7 @@ from uavrl import __version__
 from uavrl.datasets.transitions import Transitions
 from uavrl.errors import ConfigError
 from uavrl.evaluation.behaviour import behaviour
+from uavrl.evaluation.bounds import mean_age_bound_s, step_mean_age_bound_s
 from uavrl.evaluation.metrics import PERCENTILE, flight_metrics
 from uavrl.evaluation.rollouts import EvaluationSet, Flights, fly
 from uavrl.evaluation.statistics import (
@@ -230,6 +231,8 @@ def notes(scenario: Scenario, estimates: Mapping[str, Mapping[str, Estimate]]) -
             "Fading drawn once a packet and no limit on a transmission: the mean transmission time is infinite, "
             "so the mean shown depends on the sample; read the median."
         )
+    if scenario.channel.fading in ("none", "ergodic") and scenario.airframe.decision_time == "fixed":
+        yield f"No flight is fresher (docs/bounds.md): its age is at least {' or '.join(_least_ages(scenario))}."
     if objective.reward == "per_step":  # time integrals cannot be had cheaper by taking shorter steps
         always, seldom = returns_of_duty(scenario, (1, 5))
         if seldom > always:
@@ -242,6 +245,16 @@ def notes(scenario: Scenario, estimates: Mapping[str, Mapping[str, Estimate]]) -
             "'data' is the mean of its transitions times the mean length of an episode, "
             "on layouts of its own: differences to it are unpaired."
         )
+
+
+def _least_ages(scenario: Scenario) -> Iterator[str]:
+    """Of flights as long as each limit allows; shorter ones can be fresher, since ages start at 0."""
+    steps, time_s = scenario.limits.max_steps, scenario.limits.time_budget_s
+    if steps is not None:
+        yield f"{step_mean_age_bound_s(scenario, steps):.3f} s in the mean over {steps} steps"
+    if time_s is not None:
+        time_s = min(time_s, scenario.traffic.max_age_s)
+        yield f"{float(mean_age_bound_s(scenario, time_s)):.3f} s in the mean over {time_s:g} s"
 
 
 def returns_of_duty(scenario: Scenario, every: Sequence[int]) -> list[float]:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-from uavrl.agents.registry import AGENTS, changed, preset
+from uavrl.agents.registry import acts_best_deterministically, changed, preset
 from uavrl.agents.sac import SacConfig
 from uavrl.experiments.flights import Data, Setting
 from uavrl.experiments.runner import Run
@@ -83,8 +83,7 @@ class Protocol(NamedTuple):
 
     def deterministic(self, algorithm: str) -> bool:
         """Which action is judged: the one that the algorithm's class says is its best; in the paper a sample."""
-        agent = AGENTS[type(preset(ALGORITHMS[algorithm], self.preset))]
-        return self.preset == "default" and bool(getattr(agent, "acts_best_deterministically", False))
+        return self.preset == "default" and acts_best_deterministically(preset(ALGORITHMS[algorithm], self.preset))
 
 
 PROTOCOLS = {
