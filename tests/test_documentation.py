@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import subprocess
 import sys
 import textwrap
 from pathlib import Path
 
 import pytest
+
+from uavrl.cli import COMMANDS, parse
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [path for path in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))) if path.exists()]
@@ -63,6 +66,20 @@ def test_python_blocks_run(document: Path, tmp_path: Path) -> None:
         return  # prose only
     result = run(script, f"document_{document.stem}", tmp_path)
     assert result.returncode == 0, f"{document.relative_to(ROOT)}, line numbers as in the document:\n{result.stderr}"
+
+
+def test_every_command_that_is_shown_would_run() -> None:
+    """Its words are taken by its options; what stands for a user's own name is any word."""
+    shown = re.compile(r"^\$ uavrl (?P<words>.*?)(\s#.*)?$", re.MULTILINE)
+    lines = 0
+    for document in (*DOCUMENTS, *sorted((ROOT / "results").rglob("README.md"))):
+        text = document.read_text().replace("\\\n", " ")
+        for match in shown.finditer(text):
+            words = shlex.split(match["words"].split(">")[0].replace(" ... ", " "))
+            length = next(count for count in (1, 2) if " ".join(words[:count]) in COMMANDS)
+            assert parse(" ".join(words[:length]), words[length:]) is not None, match[0]
+            lines += 1
+    assert lines > 40
 
 
 def test_blocks_share_one_namespace_and_keep_their_lines() -> None:

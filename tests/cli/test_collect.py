@@ -78,6 +78,7 @@ def test_interrupted_it_goes_on_where_it_was(
         (["--out", "o", "--steps-per-update", "0"], ["steps_per_update", "0"]),
         (["--out", "o", "--seed", "1000000"], ["seed", "1000000"]),
         (["--out", "o", "--layouts", "moving"], ["moving", "fixed"]),
+        (["--out", "o", "--minari", "no version"], ["dataset id 'no version'", "name-v0"]),
         (["--out", "o", "--set", "discount=1"], ["discount", "1", "less than 1"]),
         (["--out", "o", "--set", "gamma=0.9"], ["'gamma' does not exist", "discount"]),
         (["--out", "o", "--set", "reward.transform=zscore"], ["zscore", "centred"]),

@@ -1,15 +1,18 @@
 from __future__ import annotations
 
 import json
+import signal
 from pathlib import Path
 
 import pytest
+import torch
 
 from tests.datasets.flights import fly, small_scenario
 from uavrl.agents.one_step import OneStep
 from uavrl.cli import main
 from uavrl.datasets import save_flat
 from uavrl.training.checkpoint import load_checkpoint
+from uavrl.training.offline import OfflineLearner
 from uavrl.training.policy import load_policy
 
 SMALL = [word for setting in ("network.width=8", "batch_size=8") for word in ("--set", setting)]
@@ -77,5 +80,38 @@ def test_mistakes_get_one_line(
 def test_a_run_that_is_there_is_left_alone(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--data", str(runs / "log.parquet"), "--out", str(runs / "bc")]
     assert main(["distill", str(runs / "diffusion_sac"), *words]) == 2
-    assert "holds a run already" in capsys.readouterr().err
+    assert "holds a run already; give --resume" in capsys.readouterr().err
+    assert main(["distill", str(runs / "diffusion_sac"), *words, "--resume"]) == 2
+    assert "bc' holds a run of agent 'bc', give another directory" in capsys.readouterr().err
     assert load_checkpoint(runs / "bc/checkpoint").document["agent"] == "bc"
+
+
+def test_an_interrupted_run_goes_on_to_the_same_student(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def words(out: Path) -> list[str]:
+        return ["distill", str(runs / "diffusion_sac"), "--out", str(out), "--data", str(runs / "log.parquet"),
+                "--updates", "6"]  # fmt: skip
+
+    assert main(words(tmp_path / "whole")) == 0
+    out, step = tmp_path / "cut", OfflineLearner.step
+
+    def interrupted(self: OfflineLearner) -> dict[str, torch.Tensor]:
+        if self.updates == 3:
+            signal.raise_signal(signal.SIGINT)
+        return step(self)
+
+    monkeypatch.setattr(OfflineLearner, "step", interrupted)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
+    assert main(words(out)) == 130
+    monkeypatch.undo()
+    assert load_checkpoint(out / "checkpoint").document["step"] == 4
+    assert main([*words(out), "--resume", "--seed", "1"]) == 2
+    assert capsys.readouterr().err.endswith("give the same ones: seed=0\n")
+    assert main([*words(out), "--resume"]) == 0
+    cut, whole = (load_checkpoint(place / "checkpoint") for place in (out, tmp_path / "whole"))
+    assert cut.document["step"] == 6
+    for name, value in whole.tensors["networks"].items():
+        assert (cut.tensors["networks"][name] == value).all(), name
+    assert main([*words(tmp_path / "none"), "--resume"]) == 2
+    assert "holds no checkpoint" in capsys.readouterr().err

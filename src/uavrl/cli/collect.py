@@ -39,7 +39,7 @@ class Collect:
 
     def run(self) -> None:
         from uavrl.agents.sac import SacConfig
-        from uavrl.datasets import save_flat, write_minari
+        from uavrl.datasets import free_minari_folder, save_flat, write_minari
         from uavrl.networks import NetworkConfig
         from uavrl.training.log import progress, require_tensorboard
         from uavrl.training.online import CollectConfig, OnlineLearner
@@ -59,6 +59,8 @@ class Collect:
             steps_per_update=self.steps_per_update,
             seed=self.seed,
         )
+        if self.minari is not None:
+            free_minari_folder(self.minari)
         output_directory(self.out)
         learner = OnlineLearner.resume(self.out)
         if learner is None:

@@ -8,7 +8,7 @@ from typing import Literal
 
 import tyro
 
-from uavrl.cli.settings import Many, output_directory, pydantic_config, with_settings
+from uavrl.cli.settings import Many, differing, output_directory, pydantic_config, with_settings
 from uavrl.errors import ConfigError
 
 UPDATES = 3_000
@@ -16,7 +16,7 @@ UPDATES = 3_000
 
 @dataclass(frozen=True)
 class Distill:
-    """Teach a policy of one network pass what a trained Diffusion-SAC's whole chain decides."""
+    """Teach a policy of one network pass what a Diffusion-SAC decides. Interrupted, it goes on with --resume."""
 
     checkpoint: tyro.conf.Positional[Path]
     """directory of a run of diffusion_sac, or of its checkpoint"""
@@ -34,6 +34,8 @@ class Distill:
     """where to compute"""
     evaluate_every: int = 0
     """updates between trial flights on 20 layouts of their own; 0: none"""
+    resume: bool = False
+    """go on from the checkpoint in --out"""
 
     def run(self) -> None:
         from uavrl.agents.diffusion_sac import DiffusionSac
@@ -67,11 +69,21 @@ class Distill:
             evaluate_every=self.evaluate_every,
         )
         output_directory(self.out)
-        if recover(self.out / "checkpoint") is not None:
-            raise ConfigError(f"--out '{self.out}' holds a run already; give another directory")
-        learner = OfflineLearner(config, transitions, self.device)
-        assert isinstance(learner.agent, OneStep)  # noqa: S101  # for the type checker
-        learner.agent.learn_from(teacher)
+        learner = OfflineLearner.resume(self.out, transitions, self.device) if self.resume else None
+        if learner is None:
+            if self.resume:
+                raise ConfigError(f"--resume: '{self.out}' holds no checkpoint")
+            if recover(self.out / "checkpoint") is not None:
+                raise ConfigError(f"--out '{self.out}' holds a run already; give --resume or another directory")
+            learner = OfflineLearner(config, transitions, self.device)
+            assert isinstance(learner.agent, OneStep)  # noqa: S101  # for the type checker
+            learner.agent.learn_from(teacher)
+        elif not isinstance(learner.agent, OneStep):
+            agent = learner.config.agent.name
+            raise ConfigError(f"--resume: '{self.out}' holds a run of agent '{agent}', give another directory")
+        elif learner.config != config:
+            other = differing(learner.config, config)
+            raise ConfigError(f"--resume: '{self.out}' was started with other settings, give the same ones: {other}")
         trial = trial_flights(transitions, scenario) if self.evaluate_every else None
         with progress("distill", config.updates, "update") as report:
             learner.run(self.out, report, trial)

@@ -2,7 +2,7 @@
 
 from uavrl.datasets.flat import load_flat, save_flat, stored_scenario
 from uavrl.datasets.mapped import MappedTransitions, save_mapped
-from uavrl.datasets.minari_io import read_minari, write_minari
+from uavrl.datasets.minari_io import free_minari_folder, read_minari, write_minari
 from uavrl.datasets.objective import relabelled
 from uavrl.datasets.replay import ReplayLog
 from uavrl.datasets.report import describe
@@ -20,6 +20,7 @@ __all__ = [
     "builtin_names",
     "concatenate",
     "describe",
+    "free_minari_folder",
     "load_builtin",
     "load_flat",
     "load_parts",

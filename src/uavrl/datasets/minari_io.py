@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import tomllib
 import warnings
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,25 @@ _STEPS = {
     "energy_term": "energy_term",
     "duration_s": "duration_s",
 }
+
+
+def free_minari_folder(dataset_id: str) -> Path:
+    """Where a dataset of this id is to be written; asked before an hour's flights, too.
+
+    Raises:
+        DatasetError: an invalid id, or a dataset of that id exists.
+    """
+    from minari.dataset.minari_dataset import parse_dataset_id
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    try:
+        parse_dataset_id(dataset_id)
+    except (ValueError, TypeError):  # TypeError: an id without a version
+        raise DatasetError(f"dataset id '{dataset_id}', allowed: 'name-v0' or 'namespace/name-v0'") from None
+    folder = Path(get_dataset_path(dataset_id))
+    if folder.exists():
+        raise DatasetError(f"dataset id '{dataset_id}' exists in {folder.parent}, choose another name or version")
+    return folder
 
 
 def write_minari(
@@ -58,8 +78,6 @@ def write_minari(
     """
     import minari
     from minari.data_collector import EpisodeBuffer
-    from minari.dataset.minari_dataset import parse_dataset_id
-    from minari.storage.datasets_root_dir import get_dataset_path
 
     validate(transitions, scenario, dataset_id)
     t = transitions
@@ -71,14 +89,7 @@ def write_minari(
             f"{dataset_id}: row {row}, column 'step' = {t.step[row]}, allowed: {t.step[row - 1] + 1}: Minari keeps "
             "whole episodes, write a selection to a .parquet file"
         )
-    try:
-        parse_dataset_id(dataset_id)
-    except (ValueError, TypeError):  # TypeError: an id without a version
-        raise DatasetError(f"dataset id '{dataset_id}', allowed: 'name-v0' or 'namespace/name-v0'") from None
-    folder = get_dataset_path(dataset_id)
-    if folder.exists():
-        raise DatasetError(f"dataset id '{dataset_id}' exists in {folder.parent}, choose another name or version")
-
+    folder = free_minari_folder(dataset_id)
     before, after = transitions.observations(observation_kind, scenario)
     episodes = [
         _episode(t, slice(start, stop), before, after)
