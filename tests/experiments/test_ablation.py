@@ -48,7 +48,9 @@ def test_the_bandit_is_measured_with_each_number_of_candidates(tmp_path: Path) -
     scores = measure(small(run), tmp_path)
     names = ("right_choice", "near_mode", "both")
     assert set(scores) == {*names, *(f"{name}@{count}" for name in names for count in CANDIDATES)}
-    assert all(0 <= share <= 1 for share in scores.values())
+    for end in ("", *(f"@{count}" for count in CANDIDATES)):
+        right, near, both = (scores[f"{name}{end}"] for name in names)
+        assert right + near - 1 <= both <= min(right, near)
 
 
 def test_flights_are_measured_by_either_action(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
