@@ -251,10 +251,10 @@ def _lines(figure: Figure, points: Sequence[Point]) -> Canvas:
                 axes.axhline(point["mean"], color=colour, linestyle=":", label=name)
                 continue
             x = [float(point["at"].replace(",", "")) for point in line]
-            label = name
             if metric == "decision_ms" and len(x) > 1:
-                label = f"{name}: {np.polyfit(x, [p['mean'] for p in line], 1)[0]:.3f} ms a step"
-                axes.annotate(label, (x[-1], line[-1]["mean"]), ha="right", va="bottom", fontsize=6, color=colour)
+                slope = f"{name}: {np.polyfit(x, [p['mean'] for p in line], 1)[0]:.3f} ms a step"
+                height = 0.95 - 0.09 * len(axes.texts)  # in the corner that rising lines leave free
+                axes.text(0.03, height, slope, transform=axes.transAxes, va="top", fontsize=6, color=colour)
             error = np.array([[p["mean"] - p["low"], p["high"] - p["mean"]] for p in line]).T
             axes.errorbar(
                 x, [p["mean"] for p in line], yerr=np.maximum(error, 0), color=colour, marker=marker, capsize=2,
