@@ -221,8 +221,7 @@ class Plan:
         headline = protocol.scenario.name == "released"
         short = protocol.scenario.limits.max_steps is not None  # elsewhere a flight takes four times as many steps
         learned = [run for name in ALGORITHMS for run in self.learned(name, protocol, headline=headline, curve=short)]
-        by_seed = sorted(learned, key=lambda run: run.seed)  # one seed of all first
-        return self.references(protocol) + by_seed
+        return self.references(protocol) + learned
 
     def variants(self, protocol: Protocol) -> list[Run]:
         """The six (alpha, eta)."""
@@ -329,6 +328,6 @@ FIGURES: dict[str, Figure] = {
 
 
 def wanted(scale: Scale, figures: Iterable[str] = tuple(FIGURES)) -> dict[str, list[Run]]:
-    """Each figure's runs."""
+    """Each figure's runs; one seed of all first, since a figure is drawn from the seeds that all of them have."""
     plan = Plan(scale)
-    return {name: FIGURES[name].runs(plan) for name in figures}
+    return {name: sorted(FIGURES[name].runs(plan), key=lambda run: run.seed) for name in figures}
