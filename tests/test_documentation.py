@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from uavrl.cli import COMMANDS, parse
+from uavrl.errors import ConfigError
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [path for path in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))) if path.exists()]
@@ -68,16 +69,25 @@ def test_python_blocks_run(document: Path, tmp_path: Path) -> None:
     assert result.returncode == 0, f"{document.relative_to(ROOT)}, line numbers as in the document:\n{result.stderr}"
 
 
-def test_every_command_that_is_shown_would_run() -> None:
-    """Its words are taken by its options; what stands for a user's own name is any word."""
-    shown = re.compile(r"^\$ uavrl (?P<words>.*?)(\s#.*)?$", re.MULTILINE)
+def test_the_words_of_every_command_shown_are_taken() -> None:
+    """In a console and, where it has an option, within a sentence; what stands for a user's own name is any word."""
+    shown = re.compile(r"^\$ uavrl (?P<console>.*?)(\s#.*)?$|`uavrl (?P<inline>[^`]* --[^`]*)`", re.MULTILINE)
     lines = 0
     for document in (*DOCUMENTS, *sorted((ROOT / "results").rglob("README.md"))):
         text = document.read_text().replace("\\\n", " ")
         for match in shown.finditer(text):
-            words = shlex.split(match["words"].split(">")[0].replace(" ... ", " "))
-            length = next(count for count in (1, 2) if " ".join(words[:count]) in COMMANDS)
-            assert parse(" ".join(words[:length]), words[length:]) is not None, match[0]
+            typed = (match["console"] or match["inline"]).split(" > ")[0]
+            if match["inline"] and re.search(r"\.\.\.|--\w+$", typed):
+                continue  # shortened, or about the option itself
+            words = shlex.split(typed.replace(" ... ", " "))
+            where = f"{document.relative_to(ROOT)}: {match[0]}"
+            names = [" ".join(words[:count]) for count in (1, 2) if " ".join(words[:count]) in COMMANDS]
+            assert names, where
+            try:
+                parse(names[0], words[len(names[0].split()) :])
+            except ConfigError as error:
+                if match["console"] or "Unrecognized" in str(error):  # a sentence may leave words out
+                    pytest.fail(f"{where}: {error}")
             lines += 1
     assert lines > 40
 

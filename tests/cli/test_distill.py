@@ -102,12 +102,17 @@ def test_an_interrupted_run_goes_on_to_the_same_student(
         return step(self)
 
     monkeypatch.setattr(OfflineLearner, "step", interrupted)
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
     assert main(words(out)) == 130
+    assert "saved update 4; the same command with --resume goes on" in capsys.readouterr().err
     monkeypatch.undo()
     assert load_checkpoint(out / "checkpoint").document["step"] == 4
     assert main([*words(out), "--resume", "--seed", "1"]) == 2
     assert capsys.readouterr().err.endswith("give the same ones: seed=0\n")
+    other = tmp_path / "other"
+    learn = ["--out", str(other), "--data", str(runs / "log.parquet"), "--updates", "3", "--seed", "1", *SMALL, *CHAIN]
+    assert main(["train", "diffusion_sac", *learn]) == 0
+    assert main([word.replace(str(runs / "diffusion_sac"), str(other)) for word in words(out)] + ["--resume"]) == 2
+    assert f"was started with another teacher than '{other}'" in capsys.readouterr().err
     assert main([*words(out), "--resume"]) == 0
     cut, whole = (load_checkpoint(place / "checkpoint") for place in (out, tmp_path / "whole"))
     assert cut.document["step"] == 6

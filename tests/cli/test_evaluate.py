@@ -52,10 +52,14 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_another_scenario_than_a_policy_learned_in_is_told(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["evaluate", "--scenario", "short.toml", "--episodes", "2", "--deterministic"]
     assert main([*words, "--policy", "tdm", "--policy", "pretrained:realistic"]) == 0
-    told = "pretrained:realistic learned in 'realistic', it is flown in 'released'"
-    assert told in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "pretrained:realistic learned in another scenario; channel." in told
+    assert " more differ" in told
     assert main([*words, "--policy", "pretrained:layouts@choice_prior=0"]) == 0
     assert "learned in" not in capsys.readouterr().err
+    (folder / "far.toml").write_text(load_scenario("released", max_steps=8, max_displacement_m=50.0).to_toml())
+    assert main([*words, "--policy", "pretrained:layouts", "--scenario", "far.toml"]) == 0
+    assert "layouts learned in another scenario; airframe.max_displacement_m differ" in capsys.readouterr().err
 
 
 def test_a_report_is_written_and_shown(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -125,3 +125,12 @@ def test_a_closed_pipe_ends_quietly() -> None:
 def test_parse_fills_the_dataclass(tmp_path: Path) -> None:
     command = cli.parse("scenario check", [str(tmp_path / "a.toml")])
     assert command.file == tmp_path / "a.toml"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_an_output_that_cannot_be_written_is_one_line() -> None:
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "uavrl", "--version"], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert (done.returncode, done.stderr) == (2, "uavrl: error: No space left on device\n")

@@ -24,7 +24,10 @@ def test_the_flight_is_the_one_that_evaluate_flies(tmp_path: Path, capsys: pytes
     ("words", "name"), [(["tdm"], "released"), (["pretrained:realistic"], "realistic"),
                         (["pretrained:realistic", "--scenario", "released"], "released")]
 )  # fmt: skip
-def test_a_policy_is_watched_where_it_learned(words: list[str], name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_policy_is_watched_where_it_learned(
+    words: list[str], name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     seen: list[str] = []
 
     def fly(policy: Policy, environments: EvaluationSet, **_: object) -> None:

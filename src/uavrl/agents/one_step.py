@@ -90,6 +90,14 @@ class OneStep(Agent):
             network.load_state_dict(learned)
         self.teacher.critic.load_state_dict(teacher.critic.state_dict())
 
+    def learns_from(self, teacher: DiffusionSac) -> bool:
+        """Whether the weights taken over are this teacher's."""
+        mine, theirs = (
+            {**one.actor.average.state_dict(prefix="actor."), **one.critic.state_dict(prefix="critic.")}
+            for one in (self.teacher, teacher)
+        )
+        return mine.keys() == theirs.keys() and all(torch.equal(mine[name].cpu(), theirs[name]) for name in mine)
+
     def map(self, student: Denoiser, context: Context, start: Tensor | None) -> Tensor:
         """The student's vector (B, C + D) from x_M (B, C + D), None being 0, in one pass."""
         last = torch.full((1,), self.config.teacher.diffusion.steps, device=context[0].device)

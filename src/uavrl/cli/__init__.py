@@ -56,7 +56,10 @@ _BOX = re.compile(r"\x1b\[[0-9;]*m|[\u2500-\u257f]")  # colours, and the frame t
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command and return the process's exit code: 0, 2 for a user's error, 130 interrupted, 141 pipe closed."""
+    """Run a command and return the process's exit code.
+
+    0; 2 for a user's error, or a file's or a disk's; 130 interrupted; 141 pipe closed.
+    """
     try:
         _dispatch(list(sys.argv[1:] if argv is None else argv))
         sys.stdout.flush()
@@ -67,13 +70,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("uavrl: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter's last flush fails too
+        _drop_output()
         return 141
     except OSError as error:  # a full disk, a directory that may not be written, a file where a directory is meant
         place = f"'{error.filename}': " if error.filename is not None else ""
-        print(f"uavrl: error: {place}{error.strerror or error}", file=sys.stderr)
+        print(f"uavrl: error: {place}{' '.join(str(error.strerror or error).split())}", file=sys.stderr)
+        try:
+            sys.stdout.flush()
+        except OSError:  # it is the output that cannot be written
+            _drop_output()
         return 2
     return 0
+
+
+def _drop_output() -> None:
+    """Or the interpreter's last flush fails, too."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _dispatch(words: list[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -84,9 +85,18 @@ class Distill:
         elif learner.config != config:
             other = differing(learner.config, config)
             raise ConfigError(f"--resume: '{self.out}' was started with other settings, give the same ones: {other}")
+        elif not learner.agent.learns_from(teacher):
+            raise ConfigError(f"--resume: '{self.out}' was started with another teacher than '{self.checkpoint}'")
+        else:
+            print(f"going on from update {learner.updates:,}", file=sys.stderr)
         trial = trial_flights(transitions, scenario) if self.evaluate_every else None
-        with progress("distill", config.updates, "update") as report:
-            learner.run(self.out, report, trial)
+        try:
+            with progress("distill", config.updates, "update") as report:
+                learner.run(self.out, report, trial)
+        except KeyboardInterrupt:
+            if learner.saved is not None:
+                print(f"saved update {learner.saved:,}; the same command with --resume goes on", file=sys.stderr)
+            raise
         print(f"{learner.updates:,} updates; policy of one step in {self.out}")
         where = "" if scenario.name == "released" else f" --scenario {scenario.name}"
         print(f"next: uavrl evaluate --policy {self.checkpoint} --policy {self.out} --deterministic{where}")

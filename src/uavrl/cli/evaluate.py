@@ -13,7 +13,7 @@ from rich.console import Console
 from uavrl.cli.policies import learned_in, resolve_all
 from uavrl.cli.settings import Many
 from uavrl.errors import ConfigError
-from uavrl.scenario import load_scenario
+from uavrl.scenario import Scenario, load_scenario, scenario_diff
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,9 @@ class Evaluate:
         policies = resolve_all(self.policy, scenario)
         for spec in self.policy:
             learned = learned_in(spec)
-            if learned is not None and learned.name != scenario.name:
-                print(f"{spec} learned in '{learned.name}', it is flown in '{scenario.name}'", file=sys.stderr)
+            other = [] if learned is None else _other_than(learned, scenario)
+            if other:
+                print(f"{spec} learned in another scenario; {', '.join(other)} differ", file=sys.stderr)
         data = None
         if self.data is not None:
             from uavrl.datasets.sources import load_source
@@ -82,6 +83,13 @@ class Evaluate:
         if self.markdown is not None:
             write_text(self.markdown, markdown_table(judgement.report))
         Console(width=None if sys.stdout.isatty() else 160).print(rich_table(judgement.report))
+
+
+def _other_than(learned: Scenario, flown: Scenario) -> list[str]:
+    """Fields that differ, but for a flight's length and the devices' number, which policies may well be flown with."""
+    fields = [name for name in scenario_diff(learned, flown) if not name.startswith(("name", "limits."))]
+    fields = [name for name in fields if name != "traffic.devices"]
+    return fields if len(fields) < 5 else [*fields[:4], f"{len(fields) - 4} more"]
 
 
 def check_writable(path: Path) -> None:

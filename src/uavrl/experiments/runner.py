@@ -1,4 +1,4 @@
-"""Runs that are never computed twice: a run is named by the hash of all that its result depends on.
+"""Runs that are never computed twice: a run is named by the hash of its configuration and of the package's version.
 
 Rows are appended to one JSONL file as runs finish. Until its row is written, a run keeps its checkpoints in a directory
 of its own: so an interrupted experiment goes on with what is missing, and an interrupted run with its last checkpoint.
