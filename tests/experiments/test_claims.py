@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from tests.experiments.rows import cost_of, finished_figures, row
-from uavrl.experiments.claims import CLAIMS, FAILS, HOLDS, MISSING, OPEN, READING, Results, counted, judged, table
+from uavrl.experiments.claims import CLAIMS, counted, judged, table
+from uavrl.experiments.judges import FAILS, HOLDS, MISSING, OPEN, READING, Results
 from uavrl.experiments.paper import FIGURES, OURS, PROTOCOLS
 from uavrl.experiments.runner import Run
 

@@ -12,7 +12,7 @@ from plotly.offline import get_plotlyjs
 
 from uavrl.evaluation.episode import Episode
 from uavrl.evaluation.report import write_text
-from uavrl.experiments import claims, plots, tables
+from uavrl.experiments import claims, judges, plots, tables
 from uavrl.experiments.paper import FIGURES, PROTOCOLS
 from uavrl.experiments.runner import Row, Run
 from uavrl.viewer.page import episode_figure
@@ -78,7 +78,7 @@ def write_results(
         parts += [tables.markdown(tables.table(done[name])), made(done[name], missing)]
         write_text(out / f"{name}.md", "\n\n".join(parts) + "\n")
         said.append(f"{name}: {out / name}.png, .pdf, .csv, .md" + (f"; {left}" if missing else ""))
-    found = claims.judged(claims.Results(done))
+    found = claims.judged(judges.Results(done))
     text = [
         "# The paper's claims",
         f"Eldeeb & Alves, arXiv:2606.16331. {claims.counted(found)}.",
@@ -128,7 +128,7 @@ def report_page(
         episodes: flights to play, in one scenario.
     """
     done = finished_figures(figures, rows)
-    found = claims.judged(claims.Results(done))
+    found = claims.judged(judges.Results(done))
     parts = [
         "<p>Eldeeb &amp; Alves, <i>Diffusion Offline Reinforcement Learning for Fair and Energy-Efficient UAV-Assisted "
         'Wireless Networks</i>, <a href="https://arxiv.org/abs/2606.16331">arXiv:2606.16331</a>: its figures computed '
@@ -188,7 +188,7 @@ def _table(lines: Sequence[Sequence[str]], kind: str = "numbers") -> str:
 
 
 def _cell(text: str) -> str:
-    kinds = {claims.HOLDS: "holds", claims.FAILS: "fails", claims.READING: "reading"}
+    kinds = {judges.HOLDS: "holds", judges.FAILS: "fails", judges.READING: "reading"}
     kind = f' class="{kinds[text]}"' if text in kinds else ""
     lines = escape(text).replace("\n", "<br>")
     return f"<td{kind}>{lines}</td>"
