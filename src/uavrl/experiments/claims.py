@@ -252,8 +252,8 @@ CLAIMS: tuple[Claim, ...] = (
         "A severely biased log degrades it",
         "V-D, last paragraph",
         judges.biased,
-        "services of two devices are missing from the log; a network over the set of devices sees where a device is and "
-        "how old its news are, not its number, so what it learned of the others holds for them",
+        "services of two devices are missing from the log; a network over the set of devices sees where a device is "
+        "and how old its news are, not its number, so what it learned of the others holds for them",
     ),
 )
 
