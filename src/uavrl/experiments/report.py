@@ -215,6 +215,11 @@ _PAGE = """<!DOCTYPE html>
   .holds {{ color: #00684c; font-weight: bold; }} .fails {{ color: #a33c00; font-weight: bold; }}
   .reading {{ color: #6b5200; font-weight: bold; }}
   .made {{ color: #555; font-size: 13px; }}
+  @media (max-width: 700px) {{  /* a telephone: a claim's cells one below the other */
+    .claims thead {{ display: none; }} .claims tr {{ display: block; border-bottom: 1px solid #ddd; padding: 6px 0; }}
+    .claims td, .claims td:nth-child(n) {{ display: block; min-width: 0; border: none; padding: 1px 0; }}
+    .claims td:nth-child(2) {{ font-weight: bold; }} .claims td:nth-child(3) {{ color: #555; }}
+  }}
 </style>
 </head>
 <body>
