@@ -12,6 +12,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
+from matplotlib.ticker import StrMethodFormatter
 
 from uavrl.evaluation.report import write_text
 from uavrl.evaluation.statistics import over_seeds
@@ -302,17 +303,27 @@ def _bars(figure: Figure, points: Sequence[Point]) -> Canvas:
 
 
 def _front(figure: Figure, points: Sequence[Point]) -> Canvas:
-    canvas, (axes,) = _panels(1, height_in=2.8, width_in=0.62 * _WIDTH_IN)
+    canvas, (axes,) = _panels(1, height_in=3.6, width_in=0.75 * _WIDTH_IN)
     names = _learned(points)
     look = _look(names)
-    for name in names:
+    corners = ((3, 3), (-3, 3), (3, -3), (-3, -3))  # of a point, a different one for each algorithm's labels
+    for index, name in enumerate(names):
         age = _chosen(points, name=name, metric="age_per_step_s")
         energy = _chosen(points, name=name, metric="energy_per_step_j")
         colour, marker = look[name]
         axes.plot([p["mean"] for p in age], [p["mean"] for p in energy], color=colour, marker=marker, label=name)
+        at: dict[tuple[float, float], list[str]] = {}  # who does not see lambda has one point for all of them
         for a, e in zip(age, energy, strict=True):
-            axes.annotate(a["at"], (a["mean"], e["mean"]), xytext=(3, 3), textcoords="offset points", fontsize=5.5)
+            at.setdefault((a["mean"], e["mean"]), []).append(a["at"])
+        x, y = corners[index % len(corners)]
+        place: Any = {"ha": "left" if x > 0 else "right", "va": "bottom" if y > 0 else "top"}
+        for point, weights in at.items():
+            axes.annotate(
+                ", ".join(weights), point, xytext=(x, y), textcoords="offset points", fontsize=6, color=colour, **place
+            )
     axes.set_xscale("log")
+    for axis in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
+        axis(StrMethodFormatter("{x:g}"))
     axes.set_xlabel(LABELS["age_per_step_s"])
     axes.set_ylabel(LABELS["energy_per_step_j"])
     axes.set_title("the numbers at the points are lambda, the weight of the age")
