@@ -232,8 +232,8 @@ CLAIMS: tuple[Claim, ...] = (
         "lambda does not change the order of the algorithms",
         "V-D",
         judges.same_order,
-        "judged by ours being ahead at each lambda. Scenario paper with another lambda: at a good hover energy outweighs age 2 to 1 at .5, so 18 to 1 at .1 "
-        "and 2 to 9 at .9",
+        "judged by ours being ahead at each lambda. Scenario paper with another lambda: at a good hover energy "
+        "outweighs age 2 to 1 at .5, so 18 to 1 at .1 and 2 to 9 at .9",
     ),
     Claim(
         "Fairness among devices improves",
