@@ -158,7 +158,8 @@ def _references(
     close: list[list[Point]] = []  # lines, from above, whose names would cover each other
     for point in sorted(_chosen(points, metric=metric, seeds=0), key=lambda point: -point["mean"]):
         if not low <= point["mean"] <= high:
-            outside.append(f"{point['name']} {point['mean']:,.4g}")
+            shown = ",.0f" if abs(point["mean"]) >= 1000 else ".4g"
+            outside.append(f"{point['name']} {point['mean']:{shown}}")
             continue
         axes.axhline(point["mean"], color="#777777", linestyle=(0, (4, 2)), linewidth=0.8, zorder=1)
         if close and close[-1][-1]["mean"] - point["mean"] < 0.07 * (high - low):
@@ -290,10 +291,12 @@ def _bars(figure: Figure, points: Sequence[Point]) -> Canvas:
         )  # fmt: skip
         for at, point in zip(x, line, strict=True):
             if point["mean"] < low:
-                axes.annotate(
-                    f"{point['mean']:.0f}", (at, low), ha="center", va="bottom", fontsize=6, color=look[name][0]
-                )
-    _outside(axes, _references(axes, points, "return", low, high))
+                text: Any = {"ha": "center", "va": "bottom", "fontsize": 6, "color": look[name][0], "rotation": 90}
+                text["bbox"] = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}  # a bar may come from there
+                axes.annotate(f"{point['mean']:.0f}", (at, low), xytext=(0, 3), textcoords="offset points", **text)
+    beyond = _references(axes, points, "return", low, high)
+    if beyond:  # below the axes: within them stand the numbers of points that are too low
+        axes.set_xlabel("not shown: " + ", ".join(beyond), fontsize=6, color="#777777", loc="left")
     axes.set_ylim(low, high)
     axes.set_xticks(range(len(places)), places)
     axes.set_xlim(-0.6, len(places) - 0.4)
