@@ -9,7 +9,7 @@ import pytest
 
 from tests.experiments.rows import cost_of, finished_figures, row
 from uavrl.experiments.claims import CLAIMS, counted, judged, table
-from uavrl.experiments.judges import FAILS, HOLDS, MISSING, OPEN, READING, Results
+from uavrl.experiments.judges import FAILS, HOLDS, MISSING, OPEN, READING, Results, under_readings
 from uavrl.experiments.paper import FIGURES, OURS, PROTOCOLS
 from uavrl.experiments.runner import Run
 
@@ -96,6 +96,21 @@ def test_a_verdict_turns_with_what_was_measured(figures: Figures) -> None:
     assert verdict(few, "Fewer than 10") == HOLDS
     starved = changed(figures, ("biased",), {"Diffusion-SAC @ two": 400.0})
     assert verdict(starved, "A severely biased") == HOLDS
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "expected"),
+    [
+        ([HOLDS, HOLDS, MISSING], HOLDS),
+        ([HOLDS, OPEN], READING),
+        ([HOLDS, FAILS], READING),
+        ([OPEN, FAILS, FAILS], FAILS),
+        ([OPEN, OPEN], OPEN),
+        ([MISSING], MISSING),
+    ],
+)
+def test_a_claim_depends_on_the_reading_where_it_holds_under_some(verdicts: list[str], expected: str) -> None:
+    assert under_readings(verdicts) == expected
 
 
 def test_a_figure_that_is_not_computed_leaves_its_claims_unsaid(figures: Figures) -> None:

@@ -112,6 +112,16 @@ def per(figure: str, step: str, flight: str) -> str:
     return step if objective.reward == "per_step" else flight
 
 
+def under_readings(verdicts: Sequence[str]) -> str:
+    """Of one claim under several readings: it depends on the reading where it holds under some and not under all."""
+    known = set(verdicts) - {MISSING}
+    if not known:
+        return MISSING
+    if HOLDS in known:
+        return HOLDS if known == {HOLDS} else READING
+    return FAILS if FAILS in known else OPEN
+
+
 def both(*judges: Judge) -> Judge:
     """One claim under several readings."""
 
@@ -122,8 +132,7 @@ def both(*judges: Judge) -> Judge:
                 found.append(one(results))
             except MissingRuns as missing:
                 found.append(Finding(f"{missing}: not computed", MISSING))
-        known = {finding.verdict for finding in found} - {MISSING}
-        verdict = MISSING if not known else known.pop() if len(known) == 1 else READING
+        verdict = under_readings([finding.verdict for finding in found])
         return Finding("\n".join(f"{finding.measured} ({finding.verdict})" for finding in found), verdict)
 
     return judge
@@ -297,9 +306,8 @@ def steps(few: bool) -> Judge:
             if few:  # fewer than ten should fail to pass the baselines
                 verdict = {HOLDS: FAILS, FAILS: HOLDS}.get(verdict, OPEN)
             found.append(Finding(f"{schedule}, M = {steps}: ahead of {_listed(ahead)}", verdict))
-        verdicts = {finding.verdict for finding in found}
-        verdict = verdicts.pop() if len(verdicts) == 1 else READING
-        return Finding("; ".join(finding.measured for finding in found), verdict)
+        measured = "\n".join(f"{finding.measured} ({finding.verdict})" for finding in found)
+        return Finding(measured, under_readings([finding.verdict for finding in found]))
 
     return judge
 

@@ -21,7 +21,8 @@ ABOUT = (
     "Made by `uavrl reproduce`, scale {scale}. Differences and their 95 % intervals are over training seeds and test "
     "environments, paired over the environments; positive is in the claim's favour. A claim holds where its intervals "
     "are clear of zero, or of the number it names, on its side; it does not where one is clear on the other side; else "
-    "it is open. The last column says where a claim is judged otherwise."
+    "it is open. Of several readings it depends on the reading where it holds under some; where it fails under one and "
+    "holds under none, it does not hold. The last column says where a claim is judged otherwise."
 )
 SMOKE = " **The smallest scale shows that everything runs: of the paper it says nothing.**"
 _FRAMES = 80  # of a flight on the page
