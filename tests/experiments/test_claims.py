@@ -125,7 +125,7 @@ def test_the_table_is_numbered_and_the_verdicts_counted(figures: Figures) -> Non
     lines = table(found)
     assert [line[0] for line in lines[1:]] == [str(number) for number in range(1, len(CLAIMS) + 1)]
     assert all(len(line) == 6 and "|" not in "".join(line) for line in lines)
-    assert sum(int(part.split()[0]) for part in counted(found).split(", ")) == len(CLAIMS)
+    assert sum(int(part.split(": ")[1]) for part in counted(found).split(", ")) == len(CLAIMS)
     assert set(figures) == set(FIGURES)
 
 

@@ -272,7 +272,7 @@ def judged(results: Results) -> list[tuple[Claim, Finding]]:
 def counted(found: Sequence[tuple[Claim, Finding]]) -> str:
     """How many claims have each verdict."""
     counts = {verdict: sum(finding.verdict == verdict for _, finding in found) for verdict in _VERDICTS}
-    return ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
+    return ", ".join(f"{verdict}: {count}" for verdict, count in counts.items() if count)
 
 
 def table(found: Sequence[tuple[Claim, Finding]]) -> list[list[str]]:
