@@ -13,21 +13,13 @@ import numpy as np
 from scipy.stats import f as ratio_of_variances
 
 from uavrl.evaluation.statistics import Estimate, Interval, combine
-from uavrl.experiments.paper import ONLINE, OURS, PROTOCOLS
+from uavrl.experiments.paper import ONLINE, OURS, PROTOCOLS, Protocol
 from uavrl.experiments.runner import Row, grouped
 from uavrl.experiments.tables import estimated, interval, scores
 
 HOLDS, FAILS, OPEN, READING, MISSING = "holds", "does not hold", "open", "depends on the reading", "not measured yet"
 BASELINES = ("CQL", "IQL", "BCQ")
 NEAR = 0.05  # "nearly identical", "comparable": within this share of the cost
-
-
-COMPARED_UNDER = {  # figure -> protocol
-    "comparison": "layouts",
-    "comparison-published": "published",
-    "comparison-paper": "paper-objective",
-    "comparison-realistic": "realistic",
-}
 
 
 class Finding(NamedTuple):
@@ -95,20 +87,20 @@ def beats(figure: str, metric: str, sign: float, others: Sequence[str], unit: st
 
     def judge(results: Results) -> Finding:
         ahead = {name: results.ahead(figure, OURS, name, metric, sign) for name in others}
-        return Finding(
-            f"{PROTOCOLS[_protocol(figure)].name}: ahead of {_listed(ahead)}{unit}", _verdict([*ahead.values()])
-        )
+        return Finding(f"{_protocol(figure).name}: ahead of {_listed(ahead)}{unit}", _verdict([*ahead.values()]))
 
     return judge
 
 
-def _protocol(figure: str) -> str:
-    return COMPARED_UNDER[figure]
+def _protocol(figure: str) -> Protocol:
+    """Under which a figure was computed, as its name says."""
+    named = {"comparison-paper": "paper-objective", "comparison-realistic": "realistic"}
+    return PROTOCOLS[named.get(figure, "published" if figure.endswith("published") else "layouts")]
 
 
 def per(figure: str, step: str, flight: str) -> str:
     """The metric that the figure's objective counts: a mean over steps, or over flights that take equally long."""
-    objective = PROTOCOLS[_protocol(figure)].scenario.objective
+    objective = _protocol(figure).scenario.objective
     return step if objective.reward == "per_step" else flight
 
 
@@ -122,7 +114,7 @@ def under_readings(verdicts: Sequence[str]) -> str:
     return FAILS if FAILS in known else OPEN
 
 
-def both(*judges: Judge) -> Judge:
+def readings(*judges: Judge) -> Judge:
     """One claim under several readings."""
 
     def judge(results: Results) -> Finding:
@@ -148,7 +140,7 @@ def order(figure: str) -> Judge:
             f"{OURS} over IQL": results.ahead(figure, OURS, "IQL"),
             f"{OURS} over CQL": results.ahead(figure, OURS, "CQL"),
         }
-        return Finding(f"{PROTOCOLS[_protocol(figure)].name}: {_listed(steps)}", _verdict([*steps.values()]))
+        return Finding(f"{_protocol(figure).name}: {_listed(steps)}", _verdict([*steps.values()]))
 
     return judge
 
@@ -162,9 +154,7 @@ def comparable(figure: str, first: str, second: str) -> Judge:
             verdict = HOLDS
         else:
             verdict = FAILS if min(abs(apart.low), abs(apart.high)) > NEAR and apart.low * apart.high > 0 else OPEN
-        return Finding(
-            f"{PROTOCOLS[_protocol(figure)].name}: {first} costs {_percent(apart)} more than {second}", verdict
-        )
+        return Finding(f"{_protocol(figure).name}: {first} costs {_percent(apart)} more than {second}", verdict)
 
     return judge
 
@@ -180,7 +170,7 @@ def throughput(figure: str) -> Judge:
         more = {name: results.ratio(figure, OURS, name, "throughput_mbps") for name in BASELINES}
         text = "; ".join(f"{_percent(one)} against {name}" for name, one in more.items())
         clear = _verdict([Interval(*(value - 0.35 for value in one)) for one in more.values()])
-        return Finding(f"{PROTOCOLS[_protocol(figure)].name}: throughput {text}", clear)
+        return Finding(f"{_protocol(figure).name}: throughput {text}", clear)
 
     return judge
 
@@ -193,7 +183,7 @@ def packet(figure: str) -> Judge:
         mean = results.estimate(figure, OURS, "transmission_mean_s").interval()
         verdict = HOLDS if median.high <= 0.155 else FAILS if median.low > 0.155 else OPEN
         text = f"median {interval(median, digits=3)} s, mean {interval(mean, digits=3)} s a packet"
-        return Finding(f"{PROTOCOLS[_protocol(figure)].name}: {text}", verdict)
+        return Finding(f"{_protocol(figure).name}: {text}", verdict)
 
     return judge
 
@@ -210,7 +200,7 @@ def data(results: Results) -> Finding:
     )
 
 
-def sizes(figure: str, protocol: str, names: Sequence[str], near: bool) -> Judge:
+def sizes(figure: str, names: Sequence[str], near: bool) -> Judge:
     """The cost with the fewest rows over that with the most: `near` each other, or clearly more."""
 
     def judge(results: Results) -> Finding:
@@ -223,21 +213,21 @@ def sizes(figure: str, protocol: str, names: Sequence[str], near: bool) -> Judge
             verdict = HOLDS if high <= NEAR else FAILS if low > NEAR else OPEN
         else:
             verdict = _verdict([Interval(*(value - NEAR for value in one)) for one in worse.values()])
-        return Finding(f"{PROTOCOLS[protocol].name}: cost with {small} rows over that with {large}: {text}", verdict)
+        return Finding(f"{_protocol(figure).name}: cost with {small} rows over that with {large}: {text}", verdict)
 
     return judge
 
 
 def quality(better: str, worse: str, name: str, others: Sequence[str]) -> Judge:
     """`name` beats `others` on the log `better`, and not on `worse` where that is named."""
-    return both(*(_quality_in(figure, better, worse, name, others) for figure in ("quality", "quality-published")))
+    return readings(*(_quality_in(figure, better, worse, name, others) for figure in ("quality", "quality-published")))
 
 
 def _quality_in(figure: str, better: str, worse: str, name: str, others: Sequence[str]) -> Judge:
     def judge(results: Results) -> Finding:
         here = {other: results.ahead(figure, f"{name} @ {better}", f"{other} @ {better}") for other in others}
         text, verdicts = (
-            f"{_where(figure)}: {better} log: {name} ahead of {_listed(here)}",
+            f"{_protocol(figure).name}: {better} log: {name} ahead of {_listed(here)}",
             [_verdict([*here.values()])],
         )
         if worse:
@@ -256,13 +246,9 @@ def variant(figure: str, best: str, metric: str = "return", sign: float = 1.0) -
     def judge(results: Results) -> Finding:
         others = [name for name in results.groups(figure) if name.startswith("alpha") and name != best]
         ahead = {name: results.ahead(figure, best, name, metric, sign) for name in others}
-        return Finding(f"{_where(figure)}: {best} ahead of {_listed(ahead)}", _verdict([*ahead.values()]))
+        return Finding(f"{_protocol(figure).name}: {best} ahead of {_listed(ahead)}", _verdict([*ahead.values()]))
 
     return judge
-
-
-def _where(figure: str) -> str:
-    return PROTOCOLS["published" if figure.endswith("published") else "layouts"].name
 
 
 def penalty(figure: str) -> Judge:
@@ -274,7 +260,7 @@ def penalty(figure: str) -> Judge:
             for eta in ("0", "0.5")
         }
         return Finding(
-            f"{_where(figure)}: alpha = 0 ahead of alpha = 1 at {_listed(pairs)}", _verdict([*pairs.values()])
+            f"{_protocol(figure).name}: alpha = 0 ahead of alpha = 1 at {_listed(pairs)}", _verdict([*pairs.values()])
         )
 
     return judge
@@ -287,7 +273,7 @@ def competitive(figure: str) -> Judge:
         apart = results.ratio(figure, "alpha = 0, eta = 0", "alpha = 0, eta = 0.5")
         verdict = HOLDS if apart.high <= 2 * NEAR else FAILS if apart.low > 2 * NEAR else OPEN
         text = f"eta = 0 costs {_percent(apart)} more than eta = .5 (competitive: at most 10 %)"
-        return Finding(f"{_where(figure)}: {text}", verdict)
+        return Finding(f"{_protocol(figure).name}: {text}", verdict)
 
     return judge
 
@@ -407,7 +393,7 @@ def imitation(figure: str) -> Judge:
     def judge(results: Results) -> Finding:
         ahead = results.ahead(figure, "alpha = 0, eta = 0.5", "alpha = 0, eta = 1")
         return Finding(
-            f"{_where(figure)}: eta = .5 ahead of cloning by {interval(ahead, signed=True)}", _verdict([ahead])
+            f"{_protocol(figure).name}: eta = .5 ahead of cloning by {interval(ahead, signed=True)}", _verdict([ahead])
         )
 
     return judge
