@@ -52,7 +52,7 @@ def test_finished_runs_are_drawn_and_judged_and_the_rest_is_named(
     assert {path.name for path in place.glob("*.png")} == {"comparison.png", "rates.png"}
     page = (place / "comparison.md").read_text()
     assert "| Diffusion-SAC | 2 |" in page
-    assert "Training seeds 0, 1; updates 10; 4 environments x 1 fading seeds, seed 1,000,000" in page
+    assert "training seeds 0, 1; updates 10; 4 environments x 1 fading seeds, seed 1,000,000" in page
     assert "a core, commit 012345678." in page
     claims = (place / "CLAIMS.md").read_text()
     assert "| not measured yet |" in claims

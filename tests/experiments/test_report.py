@@ -32,7 +32,7 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
     said = write_results({"comparison": RUNS, "rates": RUNS[:3]}, rows, tmp_path, "standard")
     assert "5 of 15 runs are missing" in said[0]
     text = (tmp_path / "comparison.md").read_text()
-    assert "Training seeds 0; updates 10;" in text
+    assert "Scenario released; unseen layouts; set network; training seeds 0; updates 10;" in text
     assert "5 runs of this scale are missing." in text
     assert "says nothing" not in (tmp_path / "CLAIMS.md").read_text()
     assert "of the paper it says nothing" in about("smoke")

@@ -100,8 +100,12 @@ def made(rows: Sequence[Row], missing: int) -> str:
     """How a figure's numbers were made."""
     learned = [row for row in rows if row["problem"] != "policy"]
     setting, machines = rows[0]["options"], {(row["machine"]["processor"], row["machine"]["commit"]) for row in rows}
+    networks = sorted({row["settings"]["network"]["kind"] for row in learned})
     parts = [
-        "Training seeds " + ", ".join(str(seed) for seed in sorted({row["seed"] for row in learned})),
+        f"Scenario {setting['scenario']['name']}",
+        {"fixed": "one layout", "random": "unseen layouts"}[setting["layouts"]],
+        " and ".join({"mlp": "perceptron", "devices": "set network"}[kind] for kind in networks),
+        "training seeds " + ", ".join(str(seed) for seed in sorted({row["seed"] for row in learned})),
         "updates " + ", ".join(f"{count:,}" for count in sorted({row["updates"] for row in learned})),
         f"{setting['episodes']} environments x {setting['fading_seeds']} fading seeds, seed {setting['seed']:,}",
         "last checkpoints",
