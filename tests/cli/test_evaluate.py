@@ -106,6 +106,7 @@ def test_seed_episodes_layouts_and_repeats_reach_the_flights(folder: Path) -> No
         ("--episodes 3", ["--policy"]),
         ("--policy", ["--policy"]),
         ("--policy tdm --layout fixed", ["--layout"]),
+        ("--policy tdm --policy pretrained:layouts@candidates=3 --deterministic", ["@candidates=3", "--deterministic"]),
         ("--policy short", ["short"]),
     ],
 )

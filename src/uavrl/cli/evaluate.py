@@ -58,7 +58,7 @@ class Evaluate:
         environments = evaluation_set(
             scenario, self.layouts, self.episodes, seed=self.seed, fading_seeds=self.fading_seeds
         )
-        policies = resolve_all(self.policy, scenario)
+        policies = resolve_all(self.policy, scenario, deterministic=self.deterministic)
         for spec in self.policy:
             learned = learned_in(spec)
             other = [] if learned is None else _other_than(learned, scenario)

@@ -98,10 +98,16 @@ def _split(spec: str) -> tuple[str, str]:
     return place, settings
 
 
-def resolve_all(specs: Sequence[str], scenario: Scenario) -> dict[str, Policy]:
-    """Policies by the names that a report gives them: their own, with -2, -3 ... where several share one."""
+def resolve_all(specs: Sequence[str], scenario: Scenario, *, deterministic: bool = False) -> dict[str, Policy]:
+    """Policies by the names that a report gives them: their own, with -2, -3 ... where several share one.
+
+    Raises:
+        ConfigError: as of `resolve`; or candidates to choose from in a `deterministic` flight, which has but one.
+    """
     policies: dict[str, Policy] = {}
     for spec in specs:
+        if deterministic and "candidates=" in _split(spec)[1]:
+            raise ConfigError(f"policy '{spec}' has candidates to choose from, allowed: without --deterministic")
         policy = resolve(spec, scenario)
         name, number = policy.name, 1
         while name in policies:

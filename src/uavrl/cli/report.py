@@ -40,7 +40,7 @@ class Report:
         from uavrl.scenario import load_scenario
 
         scenario = load_scenario("released")
-        policies = resolve_all(self.policy, scenario)
+        policies = resolve_all(self.policy, scenario, deterministic=True)
         figures, rows, drawn = wanted(SCALES[self.scale]), finished(store), self.results / self.scale
         write_results(figures, rows, drawn, self.scale)
         tests = evaluation_set(scenario, "random", 1)
