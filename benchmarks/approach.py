@@ -8,11 +8,13 @@ ends up.
 
 from __future__ import annotations
 
-import sys
+from typing import Literal
 
 import numpy as np
 import torch
+from tyro.conf import Positional
 
+from benchmarks import script
 from uavrl.cli.policies import resolve_all
 from uavrl.evaluation.rollouts import TRIAL_SEED, Flights, evaluation_set, fly
 from uavrl.policies import make_policy
@@ -34,20 +36,24 @@ def line(name: str, flights: Flights, hover: Flights) -> str:
     return f"| {name} | {of_start.mean():+.1f} ± {half:.1f} | {100 * idle:.1f} | {' | '.join(distances)} |"
 
 
-def main(layouts: str, *names: str) -> None:
-    """Print the table."""
-    if layouts not in ("fixed", "random"):
-        sys.exit(f"layouts = {layouts!r}, allowed: fixed, random")
+def main(layouts: Positional[Literal["fixed", "random"]], policies: Positional[tuple[str, ...]]) -> None:
+    """Print the table.
+
+    Args:
+        layouts: one, or one a flight.
+        policies: as after `uavrl evaluate --policy`.
+    """
     torch.set_num_threads(1)
     scenario = load_scenario("released")
+    flyable = resolve_all(policies, scenario, deterministic=True)
     trial = evaluation_set(scenario, layouts, STARTS, seed=TRIAL_SEED, fading_seeds=FADINGS)
     hover = fly(make_policy("hover"), trial)
     columns = ("paired to hover", f"idle after {LATER} steps, %", *(f"m left after {step}" for step in AT))
     print(f"| policy | {' | '.join(columns)} |")
     print("|---" * (1 + len(columns)) + "|")
-    for name, policy in resolve_all(list(names), scenario).items():
+    for name, policy in flyable.items():
         print(line(name, fly(policy, trial, deterministic=True), hover), flush=True)
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    script.run(main, "benchmarks.approach")

@@ -9,16 +9,18 @@ docs/what-matters.md are made of such.
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Annotated, Any, Literal, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from tyro.conf import Positional, UseAppendAction
 
+from benchmarks import script
 from uavrl.agents.diffusion_sac import DiffusionSac
 from uavrl.cli.policies import checkpoint_and_decision
+from uavrl.errors import ConfigError
 from uavrl.evaluation.rollouts import TRIAL_SEED, Flights, evaluation_set, fly
 from uavrl.policies import make_policy
 from uavrl.policies.base import Policy
@@ -107,39 +109,52 @@ def line(name: str, flights: Flights) -> str:
 
 
 def learned(spec: str | Path) -> AgentPolicy:
-    """A checkpoint's policy, whose critic knows every choice; stops where it is another."""
+    """A checkpoint's policy, whose critic knows every choice.
+
+    Raises:
+        ConfigError: it is another.
+    """
     scenario = load_scenario("released")
     path, decision = checkpoint_and_decision(str(spec))
     policy = load_policy(path, scenario, decision)
     known = isinstance(policy.agent, DiffusionSac) and policy.needs == "devices"
     if not known or trained_scenario(path) != scenario:
-        sys.exit(f"{path}: allowed here: Diffusion-SAC with a set network, trained in preset 'released'")
+        raise ConfigError(f"{path}: allowed here: Diffusion-SAC with a set network, trained in preset 'released'")
     return policy
 
 
-def main(paths: list[str]) -> None:
-    """Print the table."""
+def main(
+    paths: Positional[tuple[str, ...]],
+    held: Annotated[tuple[int, ...], UseAppendAction] = (),
+    planner: bool = False,
+) -> None:
+    """Print the table.
+
+    Args:
+        paths: runs of `uavrl train diffusion_sac`, or pretrained:NAME, with @SETTINGS behind them or not.
+        held: steps of holding the place before each policy takes over; repeat it.
+        planner: show its flights, too, which takes minutes.
+    """
     torch.set_num_threads(1)
+    policies = {path: learned(path) for path in paths}
     scenario = load_scenario("released")
     trial = evaluation_set(scenario, "random", LAYOUTS, seed=TRIAL_SEED, fading_seeds=FADINGS)
     columns = ("policy", "return", "median", f"steps 1-{EARLY}", f"idle, first {LATER} steps, %", "idle after, %")
     print(f"| {' | '.join(columns)} | flights that idle on, % |")
     print("|---" * 7 + "|")
-    held = [int(one.removeprefix("--held=")) for one in paths if one.startswith("--held=")]
 
     def show(name: str, policy: Policy) -> None:
         print(line(name, fly(policy, trial, deterministic=True)), flush=True)
         for steps in held:
             print(line(f"- after {steps} steps of holding", fly(Held(policy, steps), trial, deterministic=True)))
 
-    for name in ["hover", "planner"] if "--planner" in paths else ["hover"]:
+    for name in ["hover", "planner"] if planner else ["hover"]:
         show(name, make_policy(name))
-    for path in (path for path in paths if not path.startswith("--")):
-        policy = learned(path)
+    for path, policy in policies.items():
         show(path, policy)
         print(line("- hover's moves, its devices", fly(Swapped(policy, "hover's"), trial)))
         print(line("- its moves, hover's devices", fly(Swapped(policy, "own"), trial)), flush=True)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    script.run(main, "benchmarks.parts")

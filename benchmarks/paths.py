@@ -7,9 +7,13 @@ POLICY as after `uavrl evaluate --policy`; its deterministic action is flown.
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
+from typing import Annotated
 
+from tyro.conf import Positional, arg
+
+from benchmarks import script
+from uavrl.cli.evaluate import check_writable
 from uavrl.cli.policies import resolve_all
 from uavrl.evaluation.rollouts import evaluation_set, fly
 from uavrl.scenario import load_scenario
@@ -18,16 +22,24 @@ from uavrl.viewer.figures import trajectories
 LAYOUTS = 4
 
 
-def main(policy: str, out: str) -> None:
-    """Fly both on equal layouts, starts and draws, and draw the policy's row above the planner's."""
+def main(
+    policy: Annotated[Positional[str], arg(metavar="POLICY")], out: Annotated[Positional[Path], arg(metavar="OUT.png")]
+) -> None:
+    """Fly both on equal layouts, starts and draws, and draw the policy's row above the planner's.
+
+    Args:
+        policy: as after `uavrl evaluate --policy`.
+        out: a PNG.
+    """
+    check_writable(out)
     scenario = load_scenario("released")
     environments = evaluation_set(scenario, "random", LAYOUTS)
     flown = [
         fly(one, environments, name=name, deterministic=True)
-        for name, one in resolve_all([policy, "planner"], scenario).items()
+        for name, one in resolve_all([policy, "planner"], scenario, deterministic=True).items()
     ]
-    trajectories([flights.episode(index) for flights in flown for index in range(LAYOUTS)], Path(out))
+    trajectories([flights.episode(index) for flights in flown for index in range(LAYOUTS)], out)
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    script.run(main, "benchmarks.paths")

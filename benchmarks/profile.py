@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
+from typing import Literal
 
 from torch.profiler import ProfilerActivity, profile
+from tyro.conf import Positional
 
-from uavrl.benchmarks.train import PRESETS, learner
+from benchmarks import script
+from uavrl.benchmarks.train import learner
 
 UPDATES = 20
 KINDS = {
@@ -37,18 +39,19 @@ def measure(preset: str) -> dict[str, float]:
     return dict(spent)
 
 
-def main(preset: str) -> None:
-    """Print the table."""
-    found = measure(preset)
-    print(f"| preset {preset} | ms an update |\n|---|---|")
-    for name, milliseconds in sorted(found.items(), key=lambda entry: -entry[1]):
-        print(f"| {name} | {milliseconds:.1f} |")
-    print(f"| all | {sum(found.values()):.1f} |")
+def main(presets: Positional[tuple[Literal["paper", "default"], ...]] = ("paper", "default")) -> None:
+    """Print a table each.
+
+    Args:
+        presets: of Diffusion-SAC.
+    """
+    for preset in presets:
+        found = measure(preset)
+        print(f"| preset {preset} | ms an update |\n|---|---|")
+        for name, milliseconds in sorted(found.items(), key=lambda entry: -entry[1]):
+            print(f"| {name} | {milliseconds:.1f} |")
+        print(f"| all | {sum(found.values()):.1f} |")
 
 
 if __name__ == "__main__":
-    names = sys.argv[1:] or list(PRESETS)
-    for name in names:
-        if name not in PRESETS:
-            sys.exit(f"preset = {name!r}, allowed: {', '.join(PRESETS)}")
-        main(name)
+    script.run(main, "benchmarks.profile")

@@ -11,14 +11,14 @@ meet the border if they flew away; and those in which one draw decides. Interval
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from tyro.conf import Positional
 
+from benchmarks import script
 from benchmarks.parts import LAYOUTS, best_device, learned
 from uavrl.evaluation.rollouts import TRIAL_SEED, EvaluationSet, evaluation_set, fly
 from uavrl.policies import make_policy
@@ -86,9 +86,14 @@ def interval(values: Float, layout: NDArray[np.int64]) -> str:
     return f"{means.mean():.3f} ± {1.96 * means.std(ddof=1) / len(means) ** 0.5:.3f}"
 
 
-def main(paths: list[str]) -> None:
-    """Print the table."""
+def main(paths: Positional[tuple[str, ...]]) -> None:
+    """Print the table.
+
+    Args:
+        paths: as of `python -m benchmarks.parts`.
+    """
     torch.set_num_threads(1)
+    policies = {path: learned(path) for path in paths}
     scenario = load_scenario("released")
     trial = evaluation_set(scenario, "random", LAYOUTS, seed=TRIAL_SEED, fading_seeds=FADINGS)
     layout, size_m = np.repeat(np.arange(LAYOUTS), FADINGS), np.array([scenario.area.width_m, scenario.area.depth_m])
@@ -96,8 +101,7 @@ def main(paths: list[str]) -> None:
         "| policy | step | flights (near, border, rare) | a metre nearer, flown | by Q | a metre's cost, flown | by Q |"
     )
     print("|---" * 7 + "|")
-    for path in paths:
-        policy = learned(Path(path))
+    for path, policy in policies.items():
         for step in STEPS:
             position, way, *found = answers(policy, trial, step)
             distance = np.linalg.norm(way, axis=1)
@@ -112,4 +116,4 @@ def main(paths: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    script.run(main, "benchmarks.slopes")

@@ -17,7 +17,6 @@ A sample is what `take` takes for a minibatch of the default preset; an update i
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import shutil
@@ -27,12 +26,15 @@ from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
 from threading import Event, Thread
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from tyro.conf import Positional, arg
 
+from benchmarks import script
 from uavrl.agents.registry import preset
 from uavrl.benchmarks.timing import machine
+from uavrl.cli.evaluate import check_writable
 from uavrl.datasets import MappedTransitions, Transitions, load_source, save_mapped, select
 from uavrl.training.batches import MappedRows, to_batch
 from uavrl.training.fit import Rows
@@ -158,26 +160,34 @@ def alone(call: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, Any
     return found
 
 
-def main() -> None:
-    """Write, train, sample, delete."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--rows", type=int, default=10_000_000)
-    parser.add_argument("--updates", type=int, default=120)
-    parser.add_argument("--json", type=Path)
-    asked = parser.parse_args()
-    path = asked.folder / "copies.mapped"
+def main(
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")],
+    rows: int = 10_000_000,
+    updates: int = 120,
+    report: Annotated[Path | None, arg(name="json")] = None,
+) -> None:
+    """Write, train, sample, delete.
+
+    Args:
+        folder: where the copies lie meanwhile.
+        rows: of the copies.
+        updates: of each training.
+        report: write what was measured here.
+    """
+    if report is not None:
+        check_writable(report)
+    path = folder / "copies.mapped"
     try:
-        found = {"written": alone(write, path, asked.rows)}
+        found = {"written": alone(write, path, rows)}
         evict(path)
-        found["mapped"] = alone(train, str(path), asked.updates)
-        found["in_memory"] = alone(train, SOURCE, asked.updates)
+        found["mapped"] = alone(train, str(path), updates)
+        found["in_memory"] = alone(train, SOURCE, updates)
         found["unread"] = alone(sample_unread, path, 100)
     finally:
         shutil.rmtree(path, ignore_errors=True)
-    if asked.json is not None:
-        asked.json.write_text(json.dumps({"machine": machine(), **found}, indent=2) + "\n", encoding="utf-8")
+    if report is not None:
+        report.write_text(json.dumps({"machine": machine(), **found}, indent=2) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    script.run(main, "benchmarks.ten_million")

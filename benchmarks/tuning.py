@@ -8,11 +8,14 @@ Interrupted, it goes on with what is missing.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from tyro.conf import Positional, arg
+
+from benchmarks import script
+from uavrl.errors import ConfigError
 from uavrl.evaluation.rollouts import TRIAL_SEED
 from uavrl.experiments.flights import measure
 from uavrl.experiments.paper import ALGORITHMS, OURS, PROTOCOLS, SCALES, Plan
@@ -80,16 +83,27 @@ def runs(algorithms: Sequence[str]) -> list[Run]:
     return [run.model_copy(update={"options": run.options | own}) for run in found]
 
 
-def main(out: str, *algorithms: str) -> None:
-    """Learn what is missing and write the table."""
+def main(
+    out: Annotated[Positional[Path], arg(metavar="OUT")],
+    algorithms: Annotated[Positional[tuple[str, ...]], arg(metavar="ALGORITHM")] = tuple(ALGORITHMS),
+) -> None:
+    """Learn what is missing and write the table.
+
+    Args:
+        out: directory of the rows and of the table.
+        algorithms: whose choices.
+
+    Raises:
+        ConfigError: no such algorithm.
+    """
     for name in algorithms:
         if name not in CHOICES:
-            sys.exit(f"algorithm = {name!r}, allowed: {', '.join(CHOICES)}")
-    wanted = runs(algorithms or tuple(ALGORITHMS))
+            raise ConfigError(f"algorithm = {name!r}, allowed: {', '.join(CHOICES)}")
+    wanted = runs(algorithms)
     with progress("tuning", len(wanted), "run") as report:
-        rows = run_all(wanted, measure, Path(out) / "tuning.jsonl", WORKERS, report)
-    (Path(out) / "tuning.md").write_text(markdown(table(rows)), encoding="utf-8")
+        rows = run_all(wanted, measure, out / "tuning.jsonl", WORKERS, report)
+    (out / "tuning.md").write_text(markdown(table(rows)), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    script.run(main, "benchmarks.tuning")

@@ -31,8 +31,3 @@ def test_a_line_is_paired_to_hover_and_says_what_is_left(monkeypatch: pytest.Mon
     hover, policy = made(-1.0, [0, 10, 20, 20, 20]), made(-1.5, [0, 1, 2, 3, 4])
     # -2 and -4 behind, +-1.96 * 1.414 / sqrt 2; one step of the last two idle
     assert approach.line("one", policy, hover) == "| one | -3.0 \u00b1 2.0 | 50.0 | 20 | 18 | 16 |"
-
-
-def test_other_layouts_are_refused() -> None:
-    with pytest.raises(SystemExit, match="layouts = 'round', allowed: fixed, random"):
-        approach.main("round")

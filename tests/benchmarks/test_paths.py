@@ -16,7 +16,7 @@ def test_the_policys_row_comes_before_the_planners_on_equal_layouts(
     drawn: list[Episode] = []
     monkeypatch.setattr(paths, "load_scenario", lambda name: load_scenario(name, max_steps=3))
     monkeypatch.setattr(paths, "trajectories", lambda episodes, out: drawn.extend(episodes))
-    paths.main("tdm", str(tmp_path / "out.png"))
+    paths.main("tdm", tmp_path / "out.png")
     assert [episode.policy for episode in drawn] == ["tdm"] * paths.LAYOUTS + ["planner"] * paths.LAYOUTS
     for own, planned in zip(drawn[: paths.LAYOUTS], drawn[paths.LAYOUTS :], strict=True):
         np.testing.assert_array_equal(own.layout_m, planned.layout_m)

@@ -24,7 +24,7 @@ def test_an_update_spends_its_time_somewhere(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(profile, "UPDATES", 1)
-    profile.main("default")
+    profile.main(("default",))
     lines = capsys.readouterr().out.splitlines()
     spent = {name: float(value) for name, value in (line.strip("| ").split(" | ") for line in lines[2:])}
     assert {"products", "activations", "optimiser", "other operations"} < set(spent)

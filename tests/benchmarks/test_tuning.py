@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks import tuning
 from uavrl.agents.registry import preset
+from uavrl.errors import ConfigError
 from uavrl.evaluation.rollouts import TRIAL_SEED
 from uavrl.experiments.paper import ALGORITHMS, OURS, PROTOCOLS, SCALES, Plan
 from uavrl.experiments.runner import finished
@@ -49,6 +50,6 @@ def test_the_committed_rows_are_those_of_the_command() -> None:
 
 
 def test_an_unknown_algorithm_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(SystemExit, match=f"algorithm = 'PPO', allowed: {OURS}, CQL"):
-        tuning.main(str(tmp_path), "PPO")
+    with pytest.raises(ConfigError, match=f"algorithm = 'PPO', allowed: {OURS}, CQL"):
+        tuning.main(tmp_path, ("PPO",))
     assert not any(tmp_path.iterdir())

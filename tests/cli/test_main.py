@@ -67,7 +67,8 @@ def test_every_command_is_a_frozen_dataclass_that_explains_itself(
         (["scenario", "delete"], ["'scenario delete' does not exist", "show, diff, check"]),
         (["scenario", "show", "--fast"], ["Unrecognized options", "--fast"]),
         (["scenario", "diff", "paper"], ["Missing from uavrl scenario diff"]),
-        (["evaluate", "--episodes", "many"], ["--episodes", "INT"]),
+        (["evaluate", "--episodes", "many"], ["--episodes: 'many', allowed: a whole number (see"]),
+        (["bench", "simulate", "--seconds", "few"], ["--seconds: 'few', allowed: a number (see"]),
     ],
 )
 def test_wrong_words_get_one_line_and_code_2(
@@ -120,6 +121,16 @@ def test_a_closed_pipe_ends_quietly() -> None:
     os.close(write)
     assert process.returncode == 141
     assert process.stderr == ""
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
+def test_a_missing_word_is_named_whatever_the_output_can_show(encoding: str) -> None:
+    command = [sys.executable, "-m", "uavrl", "scenario", "diff", "paper"]
+    known = {**os.environ, "PYTHONIOENCODING": encoding}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=known)
+    expected = "Required options: Missing from uavrl scenario diff: SECOND a preset or a TOML file (required)"
+    assert done.stderr == f"uavrl: error: {expected} (see: uavrl scenario diff --help)\n"
+    assert done.returncode == 2
 
 
 def test_parse_fills_the_dataclass(tmp_path: Path) -> None:

@@ -11,11 +11,13 @@ import io
 import os
 import re
 import sys
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 from uavrl import __version__
 from uavrl.errors import ConfigError, UavrlError
+
+Made = TypeVar("Made")
 
 
 class Command(NamedTuple):
@@ -52,16 +54,26 @@ COMMANDS: dict[str, Command] = {
     "watch": Command("uavrl.cli.watch:Watch", "make a web page of one flight of a policy"),
 }
 
+_PLAINLY = {  # Python's words for a number that is none
+    r"invalid literal for int\(\) with base 10: (.*)": r"\1, allowed: a whole number",
+    r"could not convert string to float: (.*)": r"\1, allowed: a number",
+}
 _BOX = re.compile(r"\x1b\[[0-9;]*m|[\u2500-\u257f]")  # colours, and the frame that tyro draws around its errors
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command and return the process's exit code.
+    """Run a command and return the process's exit code, as of `guarded`."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    return guarded(lambda: _dispatch(words))
 
-    0; 2 for a user's error, or a file's or a disk's; 130 interrupted; 141 pipe closed.
+
+def guarded(action: Callable[[], object]) -> int:
+    """Exit code of what was done: 0; 2 for a user's error, or a file's or a disk's, told in one line; 130; 141.
+
+    130 is interrupted, 141 that nobody reads the output any more.
     """
     try:
-        _dispatch(list(sys.argv[1:] if argv is None else argv))
+        action()
         sys.stdout.flush()
     except UavrlError as error:
         print(f"uavrl: error: {' '.join(str(error).split())}", file=sys.stderr)
@@ -119,20 +131,28 @@ def parse(name: str, words: Sequence[str]) -> Any:
     """The command's dataclass, filled from the words after its name; None where they asked for help only.
 
     Raises:
+        ConfigError: as of `made_from`.
+    """
+    module, _, attribute = COMMANDS[name].target.partition(":")
+    return made_from(words, getattr(importlib.import_module(module), attribute), f"uavrl {name}")
+
+
+def made_from(words: Sequence[str], kind: Callable[..., Made], program: str) -> Made | None:
+    """What `kind`, a class or a function, makes of the words that follow `program`; None where they ask for help only.
+
+    Raises:
         ConfigError: an unknown option, a missing one, or a value that is not allowed.
     """
     import tyro  # here: `uavrl --version` does without it
 
-    module, _, attribute = COMMANDS[name].target.partition(":")
-    kind = getattr(importlib.import_module(module), attribute)
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            return tyro.cli(kind, prog=f"uavrl {name}", args=words, config=(tyro.conf.FlagCreatePairsOff,))
+            return tyro.cli(kind, prog=program, args=words, config=(tyro.conf.FlagCreatePairsOff,))
     except SystemExit as stop:
         if stop.code in (0, None):
             return None
-        raise ConfigError(f"{_condense(complaint.getvalue())} (see: uavrl {name} --help)") from None
+        raise ConfigError(f"{_condense(complaint.getvalue())} (see: {program} --help)") from None
 
 
 def _condense(box: str) -> str:
@@ -140,14 +160,19 @@ def _condense(box: str) -> str:
     lines: list[str] = []
     for raw in box.splitlines():
         line = " ".join(_BOX.sub("", raw).split())
-        if not line and lines and "\u2500" in raw:
+        if lines and (line.strip("-") == "" if line else "\u2500" in raw):
+            if len(lines) == 1:
+                continue  # the title's own rule, where the output knows ASCII alone
             break  # a rule or the frame's end: what follows repeats the help
         if line:
             lines.append(line)
     if len(lines) > 1 and lines[1].startswith(lines[0]):
         del lines[0]  # some titles repeat the message
     title, *rest = lines or ["wrong arguments"]
-    return f"{title}: {' '.join(rest)}".rstrip(": .") if rest else title
+    told = f"{title}: {' '.join(rest)}".rstrip(": .") if rest else title
+    for pythons, ours in _PLAINLY.items():
+        told = re.sub(pythons, ours, told)
+    return told
 
 
 def _usage(commands: dict[str, Command]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 
@@ -19,7 +19,7 @@ UPDATES = 3_000
 class Distill:
     """Teach a policy of one network pass what a Diffusion-SAC decides. Interrupted, it goes on with --resume."""
 
-    checkpoint: tyro.conf.Positional[Path]
+    checkpoint: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CHECKPOINT")]
     """directory of a run of diffusion_sac, or of its checkpoint"""
     out: Path
     """directory of the student's run: checkpoint and metrics.jsonl"""

@@ -18,7 +18,7 @@ from uavrl.errors import ConfigError
 class Export:
     """Write a trained policy as one ONNX file, which flies with numpy and onnxruntime alone."""
 
-    checkpoint: tyro.conf.Positional[str]
+    checkpoint: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="CHECKPOINT")]
     """directory of a run or of a checkpoint, or pretrained:NAME; behind it
     @candidates=N,greedy_choice=false,solver=ddim|dpm,steps=N changes how it decides"""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("policy.onnx")

@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 from pydantic import BaseModel
@@ -19,7 +19,7 @@ from uavrl.scenario import Scenario, load_scenario, scenario_diff
 class ScenarioShow:
     """Print a scenario as TOML, each field with its description, unit and range; save it, change it, fly it."""
 
-    scenario: tyro.conf.Positional[str] = "released"
+    scenario: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENARIO")] = "released"
     """a preset (paper, released, realistic) or a TOML file"""
 
     def run(self) -> None:
@@ -30,9 +30,9 @@ class ScenarioShow:
 class ScenarioDiff:
     """List the fields in which two scenarios differ."""
 
-    first: tyro.conf.Positional[str]
+    first: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="FIRST")]
     """a preset or a TOML file"""
-    second: tyro.conf.Positional[str]
+    second: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SECOND")]
     """a preset or a TOML file"""
 
     def run(self) -> None:
@@ -50,7 +50,7 @@ class ScenarioDiff:
 class ScenarioCheck:
     """Validate a scenario file: says that it can be flown, or which field cannot be, and why."""
 
-    file: tyro.conf.Positional[Path]
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """a TOML file"""
 
     def run(self) -> None:

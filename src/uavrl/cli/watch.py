@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -17,7 +18,7 @@ from uavrl.scenario import load_scenario
 class Watch:
     """Fly a policy once and make a web page of the flight: one file, opened by any browser, no network needed."""
 
-    policy: tyro.conf.Positional[str]
+    policy: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="POLICY")]
     """a heuristic's name, a checkpoint's directory or pretrained:NAME (@solver=dpm,steps=3 behind it: decide so), an
     .onnx file, or your own module:Class"""
     scenario: str | None = None
