@@ -26,7 +26,7 @@ from tests.agents.problems import (
     spaces,
 )
 from uavrl.agents.base import Agent
-from uavrl.agents.diffusion_sac import _deviation
+from uavrl.agents.diffusion_sac import _prior_unit
 from uavrl.agents.registry import PRESETS, make_agent, preset
 from uavrl.errors import CheckpointError, ConfigError
 from uavrl.networks import Observation, Spaces, repeat
@@ -334,7 +334,14 @@ def test_a_chain_that_is_believed_above_all_chooses_alone_but_for_ties(kind: Kin
 def test_a_padded_device_does_not_widen_the_deviation() -> None:
     q = torch.tensor([[[-3.0, -1.0, -2.0, -1e4], [-4.0, 0.0, -2.0, -1e4]]])
     real = torch.tensor([-3.0, -1.0, -2.0, -4.0, 0.0, -2.0])
-    assert float(_deviation(q)) == pytest.approx(float(real.std(correction=0)))
+    assert float(_prior_unit(q, 3)) == pytest.approx(float(real.std(correction=0)))
+
+
+def test_the_chains_opinion_weighs_less_among_more_devices_than_it_learned_with() -> None:
+    q = torch.randn(4, 2, 44, generator=generator(5))
+    whole = _prior_unit(q, 44)
+    torch.testing.assert_close(_prior_unit(q, 11), 0.25 * whole)
+    torch.testing.assert_close(_prior_unit(q, 90), whole)  # with fewer devices it counts as it did
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -120,7 +120,8 @@ class DiffusionSacConfig(AgentConfig):
         0.0,
         ge=0,
         description="weight, in units of Q's deviation over the choices, of the chain's own entries z beside the "
-        "critic's Q where that says d of a decision; 0: the critic alone",
+        "critic's Q where that says d of a decision; 0: the critic alone. Where more devices are flown than the log "
+        "had, the weight falls with their number",
     )
     candidates: int = Field(1, ge=1, description="actions drawn at a decision; the one of largest min Q is taken")
     null_candidate: bool = Field(
@@ -153,12 +154,18 @@ def held(action: HybridAction) -> HybridAction:
     return action._replace(continuous=action.continuous * (action.choice > 0)[:, None])
 
 
-def _deviation(every: Tensor) -> Tensor:
-    """Standard deviation of Q (N, M, D) over the choices of all M candidates, (N, 1, 1), padded devices left out."""
+def _prior_unit(every: Tensor, trained: int) -> Tensor:
+    """What an entry z of 1 weighs beside Q (N, M, D), (N, 1, 1): Q's deviation over the choices of all M candidates.
+
+    Among more choices than the `trained` ones of training it weighs less, in proportion: the chain's opinion does not
+    carry over to many devices, the critic's does. Padded devices are left out.
+    """
     real = every > NEVER / 2
+    share = (trained / real[:, :1].sum(dim=2, keepdim=True)).clamp(max=1.0)
     count = real.sum(dim=(1, 2), keepdim=True)
     mean = torch.where(real, every, 0.0).sum(dim=(1, 2), keepdim=True) / count
-    return (torch.where(real, every - mean, 0.0).square().sum(dim=(1, 2), keepdim=True) / count).sqrt()
+    deviation = (torch.where(real, every - mean, 0.0).square().sum(dim=(1, 2), keepdim=True) / count).sqrt()
+    return share * deviation
 
 
 class CriticNoise(NamedTuple):
@@ -391,7 +398,7 @@ class DiffusionSac(Agent):
         every = self.critic.all_choices(context, w.flatten(0, 1)).amin(dim=0).view(rows, each, -1)
         if config.greedy_choice:
             if config.choice_prior > 0:
-                every = every + config.choice_prior * _deviation(every) * z
+                every = every + config.choice_prior * _prior_unit(every, self.spaces.choices) * z
             q, choice = every[:, :count].max(dim=2)
         else:
             q = every[:, :count].gather(2, choice[..., None]).squeeze(2)
