@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks import script
 
-SCRIPTS = ("approach", "parts", "paths", "profile", "slopes", "ten_million", "tuning")
+SCRIPTS = ("approach", "parts", "paths", "profile", "seeds", "slopes", "ten_million", "tuning")
 
 
 def code(monkeypatch: pytest.MonkeyPatch, name: str, *words: str) -> int:

@@ -357,7 +357,7 @@ class DiffusionSac(Agent):
 
     @torch.no_grad()
     def act(self, observation: Observation, *, generator: torch.Generator, deterministic: bool = False) -> HybridAction:
-        """A sample of the target actor's chain, the best of `candidates` by min Q; deterministic: DDIM from zero."""
+        """A sample of the target actor's chain, the best of `candidates` as of `best`; deterministic: DDIM from zero."""
         context = self.actor.average.encode(observation)
         if deterministic:
             return self._decide(observation, context, None)
@@ -382,7 +382,10 @@ class DiffusionSac(Agent):
         return self.best(observation, self.actor.answer(context, noise), 1 if noise is None else self.config.candidates)
 
     def best(self, observation: Observation, vector: Tensor, count: int) -> HybridAction:
-        """Of each row's `count` chain outputs (C + D), in turn, the best by min Q, its choice as configured."""
+        """Of each row's `count` chain outputs (C + D), in turn, the best by min Q, its choice as configured.
+
+        With `choice_prior` the chain's entries count beside Q in every comparison: of choices, candidates, null action.
+        """
         config, continuous = self.config, self.spaces.continuous
         drawn = decode(vector, continuous)
         if count == 1 and not config.greedy_choice:
