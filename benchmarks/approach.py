@@ -43,6 +43,7 @@ def main(layouts: Positional[Literal["fixed", "random"]], policies: Positional[t
         layouts: one, or one a flight.
         policies: as after `uavrl evaluate --policy`.
     """
+    script.needed("POLICY", policies)
     torch.set_num_threads(1)
     scenario = load_scenario("released")
     flyable = resolve_all(policies, scenario, deterministic=True)

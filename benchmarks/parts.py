@@ -135,6 +135,7 @@ def main(
         held: steps of holding the place before each policy takes over; repeat it.
         planner: show its flights, too, which takes minutes.
     """
+    script.needed("RUN", paths)
     torch.set_num_threads(1)
     policies = {path: learned(path) for path in paths}
     scenario = load_scenario("released")

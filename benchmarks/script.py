@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import functools
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from uavrl.cli import guarded, made_from
+from uavrl.errors import ConfigError
 
 
 def run(main: Callable[..., None], program: str) -> None:
@@ -23,3 +24,13 @@ def run(main: Callable[..., None], program: str) -> None:
             asked()
 
     sys.exit(guarded(action))
+
+
+def needed(name: str, given: Sequence[str]) -> None:
+    """Refuse an empty list.
+
+    Raises:
+        ConfigError: nothing is `given`.
+    """
+    if not given:
+        raise ConfigError(f"{name} is missing, needed: 1 or more")

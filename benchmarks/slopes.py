@@ -92,6 +92,7 @@ def main(paths: Positional[tuple[str, ...]]) -> None:
     Args:
         paths: as of `python -m benchmarks.parts`.
     """
+    script.needed("RUN", paths)
     torch.set_num_threads(1)
     policies = {path: learned(path) for path in paths}
     scenario = load_scenario("released")

@@ -33,6 +33,9 @@ def test_every_script_says_what_it_takes(
     ("name", "words", "part"),
     [
         ("approach", ("round",), "'round'"),
+        ("approach", ("fixed",), "POLICY is missing, needed: 1 or more"),
+        ("parts", ("--planner",), "RUN is missing, needed: 1 or more"),
+        ("slopes", (), "RUN is missing, needed: 1 or more"),
         ("approach", ("fixed", "pretrained:gone"), "gone"),
         ("parts", ("nowhere",), "nowhere"),
         ("parts", ("pretrained:realistic",), "trained in preset 'released'"),

@@ -25,9 +25,9 @@ def flown(tmp_path: Path) -> tuple[Path, Transitions, Scenario]:
 def test_show_reports_and_writes_figures(
     flown: tuple[Path, Transitions, Scenario], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    assert main(["data", "show", str(flown[0]), "--json", str(tmp_path / "out" / "figures.json")]) == 0
+    assert main(["data", "show", str(flown[0]), "--json", str(tmp_path / "figures.json")]) == 0
     assert "12, of which complete 9" in capsys.readouterr().out
-    assert json.loads((tmp_path / "out" / "figures.json").read_text())["rows"] == 120
+    assert json.loads((tmp_path / "figures.json").read_text())["rows"] == 120
 
 
 def test_select_writes_the_selection(flown: tuple[Path, Transitions, Scenario], tmp_path: Path) -> None:
@@ -145,6 +145,7 @@ def test_a_bad_value_stops_a_conversion_with_the_sources_name_and_leaves_nothing
         (["relabel", "nothing", "--objective", "paper", "--out", "OUT/x.npz"], "data 'nothing' is no built-in data"),
         (["convert", "LOG", "no version"], "dataset id 'no version', allowed"),
         (["show", "LOG", "--json", "LOG/figures.json"], "figures.json"),
+        (["show", "LOG", "--json", "gone/figures.json"], "'gone' does not exist"),
     ],
 )
 def test_wrong_input_gets_one_line_and_code_2(

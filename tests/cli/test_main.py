@@ -68,6 +68,8 @@ def test_every_command_is_a_frozen_dataclass_that_explains_itself(
         (["scenario", "show", "--fast"], ["Unrecognized options", "--fast"]),
         (["scenario", "diff", "paper"], ["Missing from uavrl scenario diff"]),
         (["evaluate", "--episodes", "many"], ["--episodes: 'many', allowed: a whole number (see"]),
+        (["train", "cql", "--out", "x", "--size", "1e4"], ["--size: '1e4', allowed: INT (see"]),
+        (["evaluate", "--nowhere", "a/" * 200 + " b"], ["a/" * 200 + " b"]),
         (["bench", "simulate", "--seconds", "few"], ["--seconds: 'few', allowed: a number (see"]),
     ],
 )

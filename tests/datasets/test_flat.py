@@ -87,6 +87,11 @@ WRONG: dict[str, tuple[str, Any, str]] = {
     "nan in a list": ("next_age_s", (20, 1, np.nan), r"row 20 \(episode 1, step 8\), column 'next_age_s'\[1\] = nan"),
     "no whole device": ("device", (20, None, 1.5), "row 20, column 'device' = 1.5, allowed: whole numbers"),
     "nan device": ("device", (20, None, np.nan), "row 20, column 'device' = nan, allowed: whole numbers"),
+    "time in ms as a number": (
+        "episode",
+        (20, None, 1.7e12),
+        "row 20, column 'episode' = 1.7e.12, allowed: whole numbers to 2147483647",
+    ),
     "no truth": ("terminated", (20, None, 2.0), "row 20, column 'terminated' = 2, allowed: true or false"),
     "too large": ("reward", (20, None, 1e300), r"row 20 .*, column 'reward' = inf, allowed: a finite number"),
 }
@@ -225,3 +230,9 @@ def test_fifty_thousand_rows_are_small_and_quick(tmp_path: Path) -> None:
     started = process_time()
     load_flat(tmp_path / "log.parquet", scenario)
     assert process_time() - started < 2.0  # about 0.3 on a free core
+
+
+def test_a_column_that_is_one_number_is_named(log: Transitions, scenario: Scenario, tmp_path: Path) -> None:
+    path = write(tmp_path / "one.npz", flat(log) | {"reward": np.array(1.0)})
+    with pytest.raises(DatasetError, match="column 'reward' is one number, allowed: one or more a row"):
+        load_flat(path, scenario)

@@ -98,6 +98,12 @@ REFUSED = {
     "steps out of order": (swapped(3, 4), r"row 4 \(episode 0, step 3\), column 'step' = 3, allowed: more than"),
     "step repeated": (put("step", 4, 3), r"row 4 .*'step' = 3, allowed: more than"),
     "layout changes": (put("layout_m", (6, 0, 0), 1.0), r"row 6 .*'layout_m'\[0\]\[0\] = 1, allowed: one layout"),
+    "devices from 0": (scaled("device", 0), r"'next_age_s'\[.\] = 0, allowed: .* = age_s \+ duration_s, or 0 for the"),
+    "duration in ms": (scaled("duration_s", 1000), r"'next_age_s'\[.\] = .*duration_s or device is wrong"),
+    "time limit as an end": (
+        put("terminated", 11, True),
+        r"row 11 .*'terminated' = 1, allowed: false where nothing but",
+    ),
     "goes on after the end": (put("terminated", 6, True), r"row 6 .*'terminated' = 1, allowed: false, as the next row"),
     "goes on after a cut": (put("truncated", 6, True), r"row 6 .*'truncated' = 1, allowed: false"),
     "age jumps": (put("age_s", (6, 1), 3.25), r"row 6 .*'age_s'\[1\] = 3.25, allowed: .*, the next_age_s of the step"),

@@ -123,7 +123,7 @@ class DiffusionSacConfig(AgentConfig):
         "critic's Q where that says d of a decision; 0: the critic alone. Where more devices are flown than the log "
         "had, the weight falls with their number",
     )
-    candidates: int = Field(1, ge=1, description="actions drawn at a decision; the one of largest min Q is taken")
+    candidates: int = Field(1, ge=1, description="actions drawn at a decision; the best is taken")
     null_candidate: bool = Field(
         False,
         description="beside them stands the null action, w = 0 with choice 0 (hold the place, serve nobody), which no "
@@ -357,7 +357,7 @@ class DiffusionSac(Agent):
 
     @torch.no_grad()
     def act(self, observation: Observation, *, generator: torch.Generator, deterministic: bool = False) -> HybridAction:
-        """A sample of the target actor's chain, the best of `candidates` as of `best`; deterministic: DDIM from zero."""
+        """A sample of the target actor's chain, the best (see `best`) of `candidates`; deterministic: DDIM from 0."""
         context = self.actor.average.encode(observation)
         if deterministic:
             return self._decide(observation, context, None)

@@ -11,7 +11,7 @@ import io
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 from uavrl import __version__
@@ -57,6 +57,7 @@ COMMANDS: dict[str, Command] = {
 _PLAINLY = {  # Python's words for a number that is none
     r"invalid literal for int\(\) with base 10: (.*)": r"\1, allowed: a whole number",
     r"could not convert string to float: (.*)": r"\1, allowed: a number",
+    r"no type matching \{None\}\|(\w+) could be instantiated from \[(.*?)\]\..*": r"\2, allowed: \1",
 }
 _BOX = re.compile(r"\x1b\[[0-9;]*m|[\u2500-\u257f]")  # colours, and the frame that tyro draws around its errors
 
@@ -147,12 +148,26 @@ def made_from(words: Sequence[str], kind: Callable[..., Made], program: str) -> 
 
     complaint = io.StringIO()
     try:
-        with contextlib.redirect_stderr(complaint):
+        with contextlib.redirect_stderr(complaint), _unbroken_lines(words):
             return tyro.cli(kind, prog=program, args=words, config=(tyro.conf.FlagCreatePairsOff,))
     except SystemExit as stop:
         if stop.code in (0, None):
             return None
         raise ConfigError(f"{_condense(complaint.getvalue())} (see: {program} --help)") from None
+
+
+@contextlib.contextmanager
+def _unbroken_lines(words: Sequence[str]) -> Iterator[None]:
+    """Let tyro see a terminal of endless lines, or it breaks what the user typed; help is shown as it is."""
+    known = os.environ.get("COLUMNS")
+    if not {"-h", "--help"} & set(words):
+        os.environ["COLUMNS"] = "100000"
+    try:
+        yield
+    finally:
+        os.environ.pop("COLUMNS", None)
+        if known is not None:
+            os.environ["COLUMNS"] = known
 
 
 def _condense(box: str) -> str:

@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
+from uavrl.cli.evaluate import check_writable
 from uavrl.datasets.flat import SUFFIXES, save_flat
 from uavrl.datasets.mapped import MappedTransitions, save_mapped
 from uavrl.datasets.minari_io import write_minari
@@ -18,7 +19,6 @@ from uavrl.datasets.report import describe, render
 from uavrl.datasets.selection import Quality, select
 from uavrl.datasets.sources import load_parts, load_source
 from uavrl.datasets.transitions import Transitions
-from uavrl.errors import DatasetError
 from uavrl.scenario import load_scenario
 from uavrl.simulation.observations import ObservationKind
 
@@ -37,17 +37,15 @@ class DataShow:
     """file to write the figures to"""
 
     def run(self) -> None:
+        if self.json is not None:
+            check_writable(self.json)
         transitions, scenario = load_source(self.source, self.scenario)
         if isinstance(transitions, MappedTransitions):
             transitions.verify(self.source)
         summary = describe(transitions, scenario)
         Console().print(render(summary, self.source))
         if self.json is not None:
-            try:
-                self.json.parent.mkdir(parents=True, exist_ok=True)
-                self.json.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-            except OSError as error:
-                raise DatasetError(f"{self.json}: cannot be written: {error.strerror}") from None
+            self.json.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
 
 @dataclass(frozen=True)

@@ -141,6 +141,9 @@ def read_parts(path: str | Path, scenario: Scenario) -> Iterator[Transitions]:
 def _transitions(path: Path, columns: dict[str, NDArray[Any]], scenario: Scenario, first: int = 0) -> Transitions:
     """Columns as they are in a file, in their types in memory; `first` is the number of the first row."""
     missing = [name for name in COLUMNS if name not in columns]
+    single = [name for name in COLUMNS if name in columns and not columns[name].ndim]
+    if single:
+        raise DatasetError(f"{path}: column '{single[0]}' is one number, allowed: one or more a row")
     if missing == list(OPTIONAL) and scenario.limits.energy_budget_j is None:
         columns = columns | {name: np.zeros(len(columns["reward"])) for name in OPTIONAL}
     elif missing:
@@ -235,12 +238,12 @@ def _fit(path: Path, name: str, values: NDArray[Any], count: int, devices: int, 
     if values.dtype.kind not in "biuf":
         raise DatasetError(f"{path}: column '{name}' holds {values.dtype}, allowed: numbers: {column.meaning}")
     if column.kind != "float" and values.dtype.kind != "b":
-        limit = 2.0**31 if column.kind == "int" else 1.0
+        limit = 2.0**31 - 1 if column.kind == "int" else 1.0
         odd = ~np.isfinite(values) | (values != np.floor(values)) | (np.abs(values) > limit)
         odd = odd | (values < 0) if column.kind == "bool" else odd
         if odd.any():
             row = int(np.argmax(odd))
-            whole = "whole numbers" if column.kind == "int" else "true or false, 1 or 0"
+            whole = f"whole numbers to {limit:.0f}" if column.kind == "int" else "true or false, 1 or 0"
             _refuse(path, first + row, name, f"{values[row]:g}", f"{whole}: {column.meaning}")
     with np.errstate(over="ignore"):  # becomes infinite, which validate names
         return values.astype(column.dtype, copy=False).reshape(count, *shape)

@@ -29,8 +29,9 @@ def validate(transitions: Transitions, scenario: Scenario, source: str = "transi
     """Check transitions under a scenario.
 
     Numbers are finite and in their ranges; the reward is eq. (reward) of the scenario; moves lead from position to next
-    position; rows are sorted by (episode, step), steps increase (gaps are allowed), one layout an episode, nothing
-    follows an episode's end, and the next state of a step is the state of the step after it.
+    position; ages grow by the duration, eq. (AoI), and none but the served device's is reset; rows are sorted by
+    (episode, step), steps increase (gaps are allowed), one layout an episode, nothing follows an episode's end, which
+    is `terminated` where a battery is empty; and the next state of a step is the state of the step after it.
 
     Args:
         transitions: n rows.
@@ -46,9 +47,10 @@ def validate(transitions: Transitions, scenario: Scenario, source: str = "transi
         raise DatasetError(f"{source}: no rows, allowed: 1 or more")
     check = _Check(transitions, source, first_row)
     _ranges(check, transitions, scenario)
-    _order(check, transitions)
+    _order(check, transitions, scenario)
     _reward(check, transitions, scenario)
     _continuity(check, transitions)
+    _ages(check, transitions, scenario)
 
 
 def validated(parts: Iterable[Transitions], scenario: Scenario, source: str = "transitions") -> Iterator[Transitions]:
@@ -157,7 +159,7 @@ def _after(bad: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.concatenate([np.zeros((1, *bad.shape[1:]), dtype=bool), bad])
 
 
-def _order(check: _Check, t: Transitions) -> None:
+def _order(check: _Check, t: Transitions, scenario: Scenario) -> None:
     check.refuse("episode", _after(np.diff(t.episode) < 0), "no less than in the row before (sort by episode and step)")
     same = np.diff(t.episode) == 0
     rising = "more than in the row before of this episode (sort by episode and step)"
@@ -167,6 +169,9 @@ def _order(check: _Check, t: Transitions) -> None:
     for name in ("terminated", "truncated"):
         followed = np.append(t.columns()[name][:-1] & same, False)
         check.refuse(name, followed, "false, as the next row goes on with this episode")
+    if scenario.limits.energy_budget_j is None:
+        ends = "false where nothing but time ends a flight (energy_budget_j is null): log that as 'truncated'"
+        check.refuse("terminated", t.terminated, ends)
 
 
 def _continuity(check: _Check, t: Transitions) -> None:
@@ -179,3 +184,13 @@ def _continuity(check: _Check, t: Transitions) -> None:
         broken = _apart(now, before, _ABSOLUTE) & (follows if now.ndim == 1 else follows[:, None])
         padded = np.concatenate([t.columns()[name][:1], before])
         check.refuse(name, _after(broken), "{other}, " + f"the next_{name} of the step before", padded)
+
+
+def _ages(check: _Check, t: Transitions, scenario: Scenario) -> None:
+    grown = np.minimum(t.age_s.astype(np.float64) + t.duration_s[:, None], scenario.traffic.max_age_s)
+    served = t.device[:, None] == np.arange(1, t.devices + 1)  # whose packet may have been lost
+    wrong = _apart(t.next_age_s, grown, _ABSOLUTE) & ~(served & (t.next_age_s <= _ABSOLUTE))
+    meant = (
+        "{other} = age_s + duration_s, or 0 for the served device (1 to K; 0: nobody): duration_s or device is wrong"
+    )
+    check.refuse("next_age_s", wrong, meant, grown)

@@ -42,7 +42,10 @@ class Decision(BaseModel):
         description="whether the critic says whom to serve, or the actor itself: with one candidate no critic is asked",
     )
     choice_prior: float | None = Field(
-        None, ge=0, description="weight of the actor's own opinion where the critic says whom to serve"
+        None,
+        ge=0,
+        allow_inf_nan=False,
+        description="weight of the actor's own opinion where the critic says whom to serve",
     )
     solver: SolverName | None = Field(None, description="ddim without noise, or dpm: DPM-Solver++(2M)")
     steps: int | None = Field(None, ge=1, description="of the solver, at most M; by default M")
@@ -51,6 +54,8 @@ class Decision(BaseModel):
     def _consistent(self) -> Self:
         if self.steps is not None and self.solver is None:
             raise ValueError("steps needs a solver: ddim or dpm")
+        if self.choice_prior and self.greedy_choice is False:
+            raise ValueError("choice_prior counts beside the critic's choice, which greedy_choice=false leaves out")
         return self
 
     def apply(self, agent: Agent) -> None:
