@@ -142,6 +142,7 @@ def main(out: str = "", rates: str = "", *known: str) -> None:
     """Learn what is missing and write the table."""
     if not rates or len(known) > 1:
         sys.exit(__doc__)
+    measured = json.loads(Path(rates).read_text(encoding="utf-8"))  # now, not after hours of learning
     store, wanted = Path(out) / "equal-return.jsonl", runs()
     if known and not store.exists():
         rows = finished(Path(known[0]))
@@ -150,7 +151,7 @@ def main(out: str = "", rates: str = "", *known: str) -> None:
         write_text(store, "".join(line + "\n" for line in found))
     with progress("equal return", len(wanted), "run") as told:
         done = run_all(wanted, measure, store, WORKERS, told)
-    report(done, json.loads(Path(rates).read_text(encoding="utf-8")), Path(out))
+    report(done, measured, Path(out))
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tests.datasets.flights import fly, small_scenario
 from uavrl.datasets import COLUMNS, Transitions, load_flat, save_flat, select, stored_scenario
+from uavrl.datasets.flat import WORKED_OUT
 from uavrl.errors import DatasetError
 from uavrl.scenario import Scenario
 
@@ -236,3 +237,16 @@ def test_a_column_that_is_one_number_is_named(log: Transitions, scenario: Scenar
     path = write(tmp_path / "one.npz", flat(log) | {"reward": np.array(1.0)})
     with pytest.raises(DatasetError, match="column 'reward' is one number, allowed: one or more a row"):
         load_flat(path, scenario)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_reward_that_is_left_out_is_what_the_objective_makes_of_the_rest(
+    log: Transitions, scenario: Scenario, tmp_path: Path, suffix: str
+) -> None:
+    columns = {name: values for name, values in flat(log).items() if name not in WORKED_OUT}
+    found = load_flat(write(tmp_path / f"plain{suffix}", columns), scenario)
+    for name in WORKED_OUT:
+        np.testing.assert_allclose(found.columns()[name], log.columns()[name], rtol=1e-5, atol=1e-6)
+        assert found.columns()[name].dtype == log.columns()[name].dtype
+    with pytest.raises(DatasetError, match="column 'age_term' is missing"):
+        load_flat(write(tmp_path / f"half{suffix}", columns | {"reward": flat(log)["reward"]}), scenario)

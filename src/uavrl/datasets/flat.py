@@ -19,6 +19,7 @@ from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
 from uavrl.datasets.mapped import open_mapped, save_mapped, scenario_text
+from uavrl.datasets.objective import relabelled
 from uavrl.datasets.transitions import COLUMNS, PART_ROWS, Transitions
 from uavrl.datasets.validation import validate, validated
 from uavrl.errors import DatasetError
@@ -26,6 +27,11 @@ from uavrl.scenario import Scenario, parse_scenario
 
 SUFFIXES = (".parquet", ".npz", ".mapped")
 OPTIONAL = ("used_j", "next_used_j")  # both or neither; left out, they are 0
+WORKED_OUT = (
+    "reward",
+    "age_term",
+    "energy_term",
+)  # all or none; left out, the objective says
 
 _SCENARIO = "uavrl_scenario"  # TOML: metadata of a Parquet file, an array of npz
 _UNREADABLE = (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error, pa.ArrowException)
@@ -144,13 +150,17 @@ def _transitions(path: Path, columns: dict[str, NDArray[Any]], scenario: Scenari
     single = [name for name in COLUMNS if name in columns and not columns[name].ndim]
     if single:
         raise DatasetError(f"{path}: column '{single[0]}' is one number, allowed: one or more a row")
-    if missing == list(OPTIONAL) and scenario.limits.energy_budget_j is None:
-        columns = columns | {name: np.zeros(len(columns["reward"])) for name in OPTIONAL}
-    elif missing:
-        name = missing[0]
-        raise DatasetError(f"{path}: column '{name}' is missing: {COLUMNS[name].meaning}")
-    count, devices = len(columns["reward"]), scenario.traffic.devices
-    return Transitions(**{name: _fit(path, name, columns[name], count, devices, first) for name in COLUMNS})
+    zero: list[str] = []
+    for together, allowed in ((OPTIONAL, scenario.limits.energy_budget_j is None), (WORKED_OUT, True)):
+        if allowed and set(together) <= set(missing):
+            zero += together
+    needed = [name for name in missing if name not in zero]
+    if needed:
+        raise DatasetError(f"{path}: column '{needed[0]}' is missing: {COLUMNS[needed[0]].meaning}")
+    count, devices = len(columns["step"]), scenario.traffic.devices
+    columns = columns | {name: np.zeros(count) for name in zero}
+    read = Transitions(**{name: _fit(path, name, columns[name], count, devices, first) for name in COLUMNS})
+    return relabelled(read, scenario) if WORKED_OUT[0] in zero else read
 
 
 def stored_scenario(path: str | Path) -> Scenario | None:
@@ -232,7 +242,7 @@ def _fit(path: Path, name: str, values: NDArray[Any], count: int, devices: int, 
     if values.shape not in {(count, *shape), (count, *flat)}:
         wanted = f"({count}, {flat[0]})" if flat else f"({count},)"
         raise DatasetError(
-            f"{path}: column '{name}' has shape {values.shape}, allowed: {wanted} for the rows of 'reward' and "
+            f"{path}: column '{name}' has shape {values.shape}, allowed: {wanted} for the rows of 'step' and "
             f"the scenario's K = {devices} devices: {column.meaning}"
         )
     if values.dtype.kind not in "biuf":

@@ -143,7 +143,10 @@ def _ranges(check: _Check, t: Transitions, scenario: Scenario) -> None:
 
 def _reward(check: _Check, t: Transitions, scenario: Scenario) -> None:
     age, energy, _ = costs(t, scenario)
-    hint = " or were they logged for another objective (name that one's scenario; uavrl data relabel changes it)?"
+    hint = (
+        " or were they logged for another objective (name that one's scenario; uavrl data relabel changes it)? "
+        "Reward and terms may be left out, all three"
+    )
     reason = f"from the ages under scenario '{scenario.name}': are ages, durations or the term in other units,"
     check.refuse("age_term", _apart(t.age_term, age, _ABSOLUTE_TERM), "{other} " + reason + hint, age)
     reason = f"from next_energy_j under scenario '{scenario.name}': is the energy or the term in other units,"
