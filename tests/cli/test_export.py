@@ -9,7 +9,7 @@ import pytest
 
 from tests.training.test_policy import SCENARIO, saved
 from uavrl.cli import main
-from uavrl.cli.policies import resolve
+from uavrl.cli.policies import learned_in, resolve
 from uavrl.deployment import Policy
 from uavrl.deployment.flight import ExportedPolicy
 from uavrl.deployment.verify import Verification
@@ -37,6 +37,7 @@ def test_a_checkpoint_is_exported_verified_and_flown(folder: Path, capsys: pytes
     assert main([*words.split(), "--json", "report.json"]) == 0
     found = json.loads((folder / "report.json").read_text())["policies"]
     assert found["gaussian_bc (exported)"]["return"]["mean"] == pytest.approx(found["gaussian_bc"]["return"]["mean"])
+    assert learned_in("policy.onnx") == learned_in("run") == SCENARIO
     with pytest.raises(ConfigError, match="takes devices = 4 alone, the scenario has 10"):
         resolve("policy.onnx", load_scenario("released"))
 

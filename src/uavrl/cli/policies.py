@@ -48,8 +48,7 @@ def resolve(spec: str, scenario: Scenario) -> Policy:
         policy.name = (place if installed else policy.name) + (f"@{settings}" if settings else "")
         return policy
     if spec.endswith(".onnx"):
-        if find_spec("onnxruntime") is None:
-            raise ConfigError(f"policy '{spec}' needs onnxruntime, install it: pip install 'uavrl[deploy]'")
+        _require_onnxruntime(spec)
         from uavrl.deployment.flight import ExportedPolicy  # here: onnxruntime is an extra
 
         return ExportedPolicy(Path(spec), scenario)
@@ -62,12 +61,22 @@ def resolve(spec: str, scenario: Scenario) -> Policy:
 
 
 def learned_in(spec: str) -> Scenario | None:
-    """The scenario that a checkpoint was trained in; None for any other policy."""
+    """The scenario that a checkpoint, or what an exported file was made of, was trained in; None for any other policy.
+
+    Raises:
+        ConfigError: an exported file that cannot be read.
+        CheckpointError: a checkpoint that cannot be read.
+    """
     place, _ = _split(spec)
     if spec not in POLICIES and (place.startswith("pretrained:") or Path(place).is_dir()):
         from uavrl.training.policy import trained_scenario  # here: torch is slow to import
 
         return trained_scenario(Path(place))
+    if spec not in POLICIES and spec.endswith(".onnx"):
+        _require_onnxruntime(spec)
+        from uavrl.deployment.flight import exported_scenario  # here: onnxruntime is an extra
+
+        return exported_scenario(Path(spec))
     return None
 
 
@@ -90,6 +99,11 @@ def checkpoint_and_decision(spec: str) -> tuple[Path, Decision]:
         return Path(place), pydantic_config(Decision, **values)
     except ConfigError as error:
         raise ConfigError(f"policy '{spec}': {error}") from None
+
+
+def _require_onnxruntime(spec: str) -> None:
+    if find_spec("onnxruntime") is None:
+        raise ConfigError(f"policy '{spec}' needs onnxruntime, install it: pip install 'uavrl[deploy]'")
 
 
 def _split(spec: str) -> tuple[str, str]:

@@ -9,8 +9,24 @@ import numpy as np
 
 from uavrl.deployment.runtime import Policy, PolicyError
 from uavrl.errors import ConfigError
-from uavrl.scenario import Scenario
+from uavrl.scenario import Scenario, parse_scenario
 from uavrl.simulation.state import FlightAction
+
+
+def exported_scenario(path: Path) -> Scenario:
+    """The scenario that what was exported learned in.
+
+    Raises:
+        ConfigError: the file cannot be read.
+    """
+    return parse_scenario(_read(path).info["scenario"])
+
+
+def _read(path: Path) -> Policy:
+    try:
+        return Policy(path)
+    except PolicyError as error:
+        raise ConfigError(str(error)) from None
 
 
 class ExportedPolicy:
@@ -21,10 +37,7 @@ class ExportedPolicy:
     """
 
     def __init__(self, path: Path, scenario: Scenario) -> None:
-        try:
-            self.policy = Policy(path)
-        except PolicyError as error:
-            raise ConfigError(str(error)) from None
+        self.policy = _read(path)
         info, devices = self.policy.info, scenario.traffic.devices
         self.name = f"{info['agent']} (exported)"
         self.needs: Literal["paper", "devices", "state"] = "devices" if info["network"] == "devices" else "paper"
