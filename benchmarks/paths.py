@@ -13,8 +13,8 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from benchmarks import script
-from uavrl.cli.evaluate import check_writable
 from uavrl.cli.policies import resolve_all
+from uavrl.cli.settings import check_writable
 from uavrl.evaluation.rollouts import evaluation_set, fly
 from uavrl.scenario import load_scenario
 from uavrl.viewer.figures import trajectories

@@ -34,7 +34,7 @@ from tyro.conf import Positional, arg
 from benchmarks import script
 from uavrl.agents.registry import preset
 from uavrl.benchmarks.timing import machine
-from uavrl.cli.evaluate import check_writable
+from uavrl.cli.settings import check_writable
 from uavrl.datasets import MappedTransitions, Transitions, load_source, save_mapped, select
 from uavrl.training.batches import MappedRows, to_batch
 from uavrl.training.fit import Rows

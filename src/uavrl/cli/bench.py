@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from uavrl.cli.evaluate import check_writable
+from uavrl.cli.settings import check_writable
 from uavrl.errors import ConfigError
 
 

@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from uavrl.cli.evaluate import check_writable
+from uavrl.cli.settings import check_writable
 from uavrl.datasets.flat import SUFFIXES, save_flat
 from uavrl.datasets.mapped import MappedTransitions, save_mapped
 from uavrl.datasets.minari_io import write_minari

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 import sys
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 
 from uavrl.cli.policies import learned_in, resolve_all
-from uavrl.cli.settings import Many
+from uavrl.cli.settings import Many, check_writable
 from uavrl.errors import ConfigError
 from uavrl.scenario import Scenario, load_scenario, scenario_diff
 
@@ -90,17 +89,3 @@ def _other_than(learned: Scenario, flown: Scenario) -> list[str]:
     fields = [name for name in scenario_diff(learned, flown) if not name.startswith(("name", "limits."))]
     fields = [name for name in fields if name != "traffic.devices"]
     return fields if len(fields) < 5 else [*fields[:4], f"{len(fields) - 4} more"]
-
-
-def check_writable(path: Path) -> None:
-    """Refuse now what could not be written after an hour's flights.
-
-    Raises:
-        ConfigError: `path` is a directory, or lies in one that does not exist or may not be written.
-    """
-    if path.is_dir():
-        raise ConfigError(f"file '{path}' is a directory, allowed: a file to write")
-    if not path.parent.is_dir():
-        raise ConfigError(f"file '{path}': the directory '{path.parent}' does not exist, make it first")
-    if not os.access(path.parent, os.W_OK):
-        raise ConfigError(f"file '{path}' cannot be written: no permission in '{path.parent}'")

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import tyro
 
-from uavrl.cli.evaluate import check_writable
 from uavrl.cli.policies import checkpoint_and_decision
+from uavrl.cli.settings import check_writable
 from uavrl.errors import ConfigError
 
 

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from uavrl.cli.evaluate import check_writable
 from uavrl.cli.policies import resolve_all
-from uavrl.cli.settings import Many
+from uavrl.cli.settings import Many, check_writable
 from uavrl.errors import ConfigError
 
 

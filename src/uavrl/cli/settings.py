@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -83,3 +84,17 @@ def output_directory(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"--out '{path}' cannot be made, allowed: a directory ({error.strerror})") from None
+
+
+def check_writable(path: Path) -> None:
+    """Refuse now what could not be written after an hour's flights.
+
+    Raises:
+        ConfigError: `path` is a directory, or lies in one that does not exist or may not be written.
+    """
+    if path.is_dir():
+        raise ConfigError(f"file '{path}' is a directory, allowed: a file to write")
+    if not path.parent.is_dir():
+        raise ConfigError(f"file '{path}': the directory '{path.parent}' does not exist, make it first")
+    if not os.access(path.parent, os.W_OK):
+        raise ConfigError(f"file '{path}' cannot be written: no permission in '{path.parent}'")

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from uavrl.cli.evaluate import check_writable
 from uavrl.cli.policies import learned_in, resolve
+from uavrl.cli.settings import check_writable
 from uavrl.errors import ConfigError
 from uavrl.scenario import load_scenario
 
