@@ -11,7 +11,6 @@ it goes on with what is missing.
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +18,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from tyro.conf import Positional
 
+from benchmarks import script
+from uavrl.errors import ConfigError
 from uavrl.evaluation.report import write_text
 from uavrl.evaluation.statistics import Interval, over_seeds
 from uavrl.experiments.flights import flown, measure
@@ -58,7 +60,7 @@ def curves(rows: Sequence[Row], variant: str, per_s: float) -> Curves:
     every = sorted((row for row in rows if row["variant"] == variant), key=lambda row: row["seed"])
     own = [row for row in every if "diverged" not in row["scores"]]  # whose curve is shorter
     if not own:
-        sys.exit(f"every run of {variant} diverged")
+        raise ConfigError(f"every run of {variant} diverged")
     at = np.array(own[0]["scores"]["curve"]["at"], dtype=np.float64)
     return Curves(at / per_s, np.array([row["scores"]["curve"]["return"] for row in own], dtype=np.float64))
 
@@ -138,21 +140,32 @@ def _figure(paper: Curves, ours: Curves, known: dict[str, float], wanted: float,
     figure.savefig(path, dpi=200)
 
 
-def main(out: str = "", rates: str = "", *known: str) -> None:
-    """Learn what is missing and write the table."""
-    if not rates or len(known) > 1:
-        sys.exit(__doc__)
-    measured = json.loads(Path(rates).read_text(encoding="utf-8"))  # now, not after hours of learning
-    store, wanted = Path(out) / "equal-return.jsonl", runs()
-    if known and not store.exists():
-        rows = finished(Path(known[0]))
-        Path(out).mkdir(parents=True, exist_ok=True)
-        found = [json.dumps(rows[run.key]) for run in wanted if run.key in rows]
+def main(out: Positional[Path], rates: Positional[Path], rows: Positional[Path | None] = None) -> None:
+    """Learn what is missing and write the table.
+
+    Args:
+        out: directory of equal-return.jsonl, .md and .png.
+        rates: what `uavrl bench train --json` has written.
+        rows: of `uavrl reproduce`, which may hold the paper's runs already.
+
+    Raises:
+        ConfigError: rates that are missing, or not those of that command.
+    """
+    try:
+        measured = json.loads(rates.read_text(encoding="utf-8"))  # now, not after hours of learning
+        float(measured["paper_updates_per_s"]), float(measured["default_updates_per_s"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"rates = '{rates}', allowed: a file of `uavrl bench train --json`") from error
+    store, wanted = out / "equal-return.jsonl", runs()
+    if rows is not None and not store.exists():
+        known = finished(rows)
+        out.mkdir(parents=True, exist_ok=True)
+        found = [json.dumps(known[run.key]) for run in wanted if run.key in known]
         write_text(store, "".join(line + "\n" for line in found))
     with progress("equal return", len(wanted), "run") as told:
         done = run_all(wanted, measure, store, WORKERS, told)
-    report(done, measured, Path(out))
+    report(done, measured, out)
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    script.run(main, "benchmarks.equal_return")

@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks import equal_return
 from benchmarks.equal_return import DEFAULT, PAPER, Curves
+from uavrl.errors import ConfigError
 from uavrl.experiments.paper import PROTOCOLS, SCALES, Plan
 
 
@@ -68,7 +69,10 @@ def test_the_table_says_how_long_each_seed_takes(tmp_path: Path) -> None:
     assert (tmp_path / "equal-return.png").stat().st_size > 10_000
 
 
-def test_wrong_words_are_refused() -> None:
-    for words in ((), ("out",), ("a", "b", "c", "d")):
-        with pytest.raises(SystemExit, match="How long until"):
-            equal_return.main(*words)
+@pytest.mark.parametrize("text", ["no JSON", "[]", '{"paper_updates_per_s": 3.0}', '{"paper_updates_per_s": null}'])
+def test_rates_of_another_command_are_refused_before_anything_is_learned(text: str, tmp_path: Path) -> None:
+    rates = tmp_path / "rates.json"
+    rates.write_text(text)
+    with pytest.raises(ConfigError, match=r"rates = '.*rates.json', allowed: a file of `uavrl bench train --json`"):
+        equal_return.main(tmp_path / "out", rates)
+    assert not (tmp_path / "out").exists()

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks import script
 
-SCRIPTS = ("approach", "parts", "paths", "profile", "seeds", "slopes", "ten_million", "tuning")
+SCRIPTS = ("approach", "equal_return", "parts", "paths", "profile", "seeds", "slopes", "ten_million", "tuning")
 
 
 def code(monkeypatch: pytest.MonkeyPatch, name: str, *words: str) -> int:
@@ -38,6 +38,7 @@ def test_every_script_says_what_it_takes(
         ("slopes", (), "RUN is missing, needed: 1 or more"),
         ("approach", ("fixed", "pretrained:gone"), "gone"),
         ("parts", ("nowhere",), "nowhere"),
+        ("equal_return", ("out", "nowhere.json"), "rates = 'nowhere.json', allowed: a file of `uavrl bench train"),
         ("parts", ("pretrained:realistic",), "trained in preset 'released'"),
         ("parts", ("--held=few", "pretrained:layouts"), "few"),
         ("paths", ("tdm",), "OUT.png"),
