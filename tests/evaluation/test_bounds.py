@@ -11,6 +11,7 @@ import pytest
 from tests.policies.flying import fly, layouts_and_starts
 from uavrl.errors import ConfigError
 from uavrl.evaluation.bounds import hover_age_bound_s, mean_age_bound_s, service_s, step_mean_age_bound_s
+from uavrl.physics.channel import expected_service
 from uavrl.policies import POLICIES, make_policy
 from uavrl.scenario import PRESETS, Scenario
 
@@ -85,6 +86,38 @@ def test_nothing_simulated_is_below(scenario: Scenario) -> None:
             assert (flown.time_age_s >= hover_age_bound_s(scenario, where, start, flown.time_s)).all(), name
 
 
+LOSSY = PRESETS["realistic"].replace(time_budget_s=80.0)
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [LOSSY, LOSSY.replace(fading="rayleigh", max_transmission_s=0.12)],
+    ids=["rician, hardly a loss", "rayleigh, many lost"],
+)
+def test_under_fading_a_packet_the_mean_over_flights_is_not_below_nor_far(scenario: Scenario) -> None:
+    start = layouts_and_starts(scenario, 40, 1_000_000)[1]
+    above = np.repeat(start[:, None], 10, axis=1)
+    flown = fly(scenario, make_policy("index"), 40, layout_m=above)
+    bounds = mean_age_bound_s(scenario, flown.time_s)
+    assert 1.0 <= (flown.time_age_s / bounds).mean() < 1.08
+    assert (flown.time_age_s / mean_age_bound_s(scenario.replace(fading="none"), flown.time_s)).mean() > 1.0
+    np.testing.assert_allclose(hover_age_bound_s(scenario, above, start, flown.time_s), bounds)
+
+
+@pytest.mark.parametrize(("limit_s", "overhead"), [(0.1, False), (0.5, True)])
+def test_under_fading_the_bound_counts_the_fastest_delivery_from_anywhere(limit_s: float, overhead: bool) -> None:
+    """Overhead there is no luck: under a limit below the mean, fading farther away delivers more."""
+    scenario, away_m = LOSSY.replace(max_transmission_s=limit_s), np.linspace(0.0, 300.0, 61)
+    seconds, arrival = expected_service(away_m, np.full(61, 2e6), scenario.channel)
+    delivery_s = (seconds + 0.02) / arrival
+    np.testing.assert_allclose(service_s(scenario, away_m[:, None])[:, 0], delivery_s)
+    least_s = 10 * delivery_s.min()
+    assert (delivery_s.argmin() == 0) == overhead
+    assert mean_age_bound_s(scenario, 50.0) == pytest.approx(
+        25.0 * least_s / (50.0 + limit_s + 0.02 + least_s), rel=1e-3
+    )
+
+
 def test_hovering_above_everything_is_the_general_bound_and_farther_is_worse() -> None:
     layout = np.full((1, 10, 2), 300.0)
     above, beside = (hover_age_bound_s(NONE, layout, np.array([[x, 300.0]]), 100.0)[0] for x in (300.0, 500.0))
@@ -103,7 +136,7 @@ def test_a_device_out_of_reach_is_as_old_as_the_flight() -> None:
 @pytest.mark.parametrize(
     ("overrides", "elapsed", "message"),
     [
-        ({"fading": "rayleigh"}, 10.0, "channel.fading = 'rayleigh'"),
+        ({"fading": "rayleigh"}, 10.0, "channel.fading = 'rayleigh' without channel.max_transmission_s"),
         ({"decision_time": "measured"}, 10.0, "airframe.decision_time = 'measured'"),
         ({"max_age_s": 5.0}, 10.0, "elapsed_s = 10, allowed: at most traffic.max_age_s = 5"),
         ({}, 0.0, "elapsed_s = 0, allowed"),
@@ -112,3 +145,8 @@ def test_a_device_out_of_reach_is_as_old_as_the_flight() -> None:
 def test_what_has_no_bound_is_refused(overrides: dict[str, Any], elapsed: float, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         mean_age_bound_s(NONE.replace(**overrides), elapsed)
+
+
+def test_ages_after_each_step_have_no_bound_under_fading_a_packet() -> None:
+    with pytest.raises(ConfigError, match=r"channel\.fading = 'rician': the bound a step needs"):
+        step_mean_age_bound_s(LOSSY, 10)

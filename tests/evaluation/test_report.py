@@ -207,3 +207,7 @@ def test_lower_bounds_are_told_where_service_times_have_them(changes: dict[str, 
     calm = load_scenario("released", fading="none", **changes)
     assert f"Whoever flies, the mean age is at least {bound} (docs/bounds.md)." in [*notes(calm, {})]
     assert not any("Whoever flies" in note for note in notes(calm.replace(decision_time="measured"), {}))
+    lossy = PRESETS["realistic"]  # fading drawn once a packet, which is lost after a limit
+    told = "In the mean over the fading, whoever flies, the mean age is at least 0.638 s a second over 400 s"
+    assert f"{told} (docs/bounds.md)." in [*notes(lossy, {})]
+    assert not any("whoever flies" in note for note in notes(lossy.replace(max_steps=400), {}))

@@ -1,7 +1,8 @@
 """Lower bounds on the age of information, derived in docs/bounds.md.
 
-They hold where every service takes a known least time: fading "none" or "ergodic" (a lucky Rayleigh draw beats any of
-them) and a fixed decision time. Ages start at 0. Priorities and packet sizes may differ between the devices.
+They hold for each flight where every service takes a known least time: fading "none" or "ergodic" and a fixed decision
+time. Under fading drawn once a packet a lucky flight beats any of them; those over time hold there in the mean over the
+fading, if a packet is lost after a limit. Ages start at 0. Priorities and packet sizes may differ between the devices.
 """
 
 from __future__ import annotations
@@ -11,27 +12,39 @@ from numpy.typing import ArrayLike, NDArray
 
 from uavrl.errors import ConfigError
 from uavrl.physics import channel
+from uavrl.policies.service import service_model
 from uavrl.scenario import Scenario
 
 Float = NDArray[np.float64]
 
 
 def service_s(scenario: Scenario, horizontal_m: ArrayLike) -> Float:
-    """c_k = T_com + T_exec (s) at horizontal distances (..., K) or one number; infinite where every packet is lost.
+    """c_k (s) at horizontal distances (..., K) or one number: T_com + T_exec, infinite where every packet is lost.
+
+    Under fading drawn once a packet the mean time of a delivery, (E[min(T_com, limit)] + T_exec) / P(T_com <= limit).
 
     Raises:
-        ConfigError: the scenario's service times are random or measured, so that nothing bounds them.
+        ConfigError: the scenario's service times are measured, or random without a limit: nothing bounds them.
     """
     link = scenario.channel
-    if link.fading not in ("none", "ergodic"):
-        raise ConfigError(f"channel.fading = {link.fading!r}: the bounds need 'none' or 'ergodic'")
+    if fades(scenario) and link.max_transmission_s is None:
+        raise ConfigError(
+            f"channel.fading = {link.fading!r} without channel.max_transmission_s: "
+            "the bounds need 'none', 'ergodic' or that limit"
+        )
     if scenario.airframe.decision_time != "fixed":
         raise ConfigError(f"airframe.decision_time = {scenario.airframe.decision_time!r}: the bounds need 'fixed'")
     bits = np.array(scenario.traffic.packet_bits_each)
     distance_m, bits = np.broadcast_arrays(np.asarray(horizontal_m, dtype=np.float64), bits)
     seconds, arrival = channel.expected_service(distance_m, bits, link)
-    service: Float = np.where(arrival > 0, seconds + scenario.airframe.decision_s, np.inf)
+    with np.errstate(divide="ignore", over="ignore"):  # to infinity where (almost) nothing arrives
+        service: Float = (seconds + scenario.airframe.decision_s) / arrival
     return service
+
+
+def fades(scenario: Scenario) -> bool:
+    """Whether fading is drawn once a packet, so that a bound can hold in the mean alone."""
+    return scenario.channel.fading in ("rayleigh", "rician")
 
 
 def _time_bound_s(scenario: Scenario, service: Float, elapsed_s: ArrayLike) -> Float:
@@ -48,19 +61,26 @@ def _time_bound_s(scenario: Scenario, service: Float, elapsed_s: ArrayLike) -> F
     finite = np.where(can, service, 0.0)
     root = np.sqrt(priority * finite).sum(axis=-1)
     never = np.where(can, 0.0, priority).sum(axis=-1)
-    bound: Float = 0.5 * elapsed * (root**2 / (elapsed + finite.sum(axis=-1)) + never)
+    longest = scenario.channel.max_transmission_s
+    late = longest + scenario.airframe.decision_s if longest is not None and fades(scenario) else 0.0
+    bound: Float = 0.5 * elapsed * (root**2 / (elapsed + late + finite.sum(axis=-1)) + never)
     return bound
 
 
 def mean_age_bound_s(scenario: Scenario, elapsed_s: ArrayLike) -> Float:
     """Least time average of sum_k delta_k A_k over the first `elapsed_s` (...) of any flight, (...) (s).
 
-    (T/2) (sum_k sqrt(delta_k c_k))^2 / (T + sum_k c_k), with c_k the service time from straight above device k.
+    (T/2) (sum_k sqrt(delta_k c_k))^2 / (T + sum_k c_k), with c_k the service time from straight above device k. Under
+    fading drawn once a packet in the mean over flights, with the longest service added to the denominator, and with c_k
+    from where it is least: under a limit near the mean, fading far away delivers what no luck does overhead.
 
     Raises:
-        ConfigError: random service times, or a time that is not positive or at which ages are clipped.
+        ConfigError: as `service_s`, or a time that is not positive or at which ages are clipped.
     """
-    return _time_bound_s(scenario, service_s(scenario, 0.0), elapsed_s)
+    service = service_s(scenario, 0.0)
+    if fades(scenario):
+        service = np.minimum(service, service_model(scenario).shortest_s)
+    return _time_bound_s(scenario, service, elapsed_s)
 
 
 def hover_age_bound_s(scenario: Scenario, layout_m: Float, position_m: Float, elapsed_s: ArrayLike) -> Float:
@@ -82,8 +102,10 @@ def step_mean_age_bound_s(scenario: Scenario, steps: int) -> float:
     [j (j-1) c / 2 + (K-j) (j c + (i-j) e)] / K, with e the shortest step without service.
 
     Raises:
-        ConfigError: random service times, or no step.
+        ConfigError: random or measured service times, or no step.
     """
+    if fades(scenario):
+        raise ConfigError(f"channel.fading = {scenario.channel.fading!r}: the bound a step needs 'none' or 'ergodic'")
     if steps < 1:
         raise ConfigError(f"steps = {steps}, allowed: 1 or more")
     frame, oldest_s = scenario.airframe, scenario.traffic.max_age_s

@@ -23,7 +23,7 @@ from uavrl import __version__
 from uavrl.datasets.transitions import Transitions
 from uavrl.errors import ConfigError
 from uavrl.evaluation.behaviour import behaviour
-from uavrl.evaluation.bounds import mean_age_bound_s, step_mean_age_bound_s
+from uavrl.evaluation.bounds import fades, mean_age_bound_s, step_mean_age_bound_s
 from uavrl.evaluation.metrics import PERCENTILE, flight_metrics
 from uavrl.evaluation.rollouts import EvaluationSet, Flights, fly
 from uavrl.evaluation.statistics import (
@@ -226,13 +226,15 @@ def notes(scenario: Scenario, estimates: Mapping[str, Mapping[str, Estimate]]) -
         f"Scenario '{scenario.name}': objective {objective.reward}, a flight ends after {' or '.join(ends)}, "
         f"fading {scenario.channel.fading}."
     )
-    if scenario.channel.fading in ("rayleigh", "rician") and scenario.channel.max_transmission_s is None:
+    if fades(scenario) and scenario.channel.max_transmission_s is None:
         yield (
             "Fading drawn once a packet and no limit on a transmission: the mean transmission time is infinite, "
             "so the mean shown depends on the sample; read the median."
         )
-    if scenario.channel.fading in ("none", "ergodic") and scenario.airframe.decision_time == "fixed":
-        yield f"Whoever flies, the mean age is at least {_least_age_s(scenario)} (docs/bounds.md)."
+    least = _least_age_s(scenario)
+    if least is not None:
+        who = "In the mean over the fading, whoever flies" if fades(scenario) else "Whoever flies"
+        yield f"{who}, the mean age is at least {least} (docs/bounds.md)."
     if objective.reward == "per_step":  # time integrals cannot be had cheaper by taking shorter steps
         always, seldom = returns_of_duty(scenario, (1, 5))
         if seldom > always:
@@ -247,9 +249,16 @@ def notes(scenario: Scenario, estimates: Mapping[str, Mapping[str, Estimate]]) -
         )
 
 
-def _least_age_s(scenario: Scenario) -> str:
-    """Of a flight as long as the first limit allows; a shorter one can be fresher, since ages start at 0."""
+def _least_age_s(scenario: Scenario) -> str | None:
+    """Of a flight as long as the first limit allows; a shorter one can be fresher, since ages start at 0.
+
+    None where no bound is known.
+    """
     steps, time_s = scenario.limits.max_steps, scenario.limits.time_budget_s
+    if scenario.airframe.decision_time != "fixed":
+        return None
+    if fades(scenario) and (steps is not None or scenario.channel.max_transmission_s is None):
+        return None
     shares = sum(scenario.traffic.priority_each)  # tables weigh ages by shares of the priorities
     if steps is not None:
         return f"{step_mean_age_bound_s(scenario, steps) / shares:.3f} s a step over {steps} steps"

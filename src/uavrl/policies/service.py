@@ -37,7 +37,7 @@ class ServiceModel:
         parts = [np.broadcast_arrays(part, sizes[:, None]) for part in np.split(distance_m, _TABLE // _PART)]
         services = [channel.expected_service(part, bits, scenario.channel) for part, bits in parts]
         seconds, arrival = (np.concatenate(values, axis=1) for values in zip(*services, strict=True))
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", over="ignore"):  # hardly a packet may arrive, or none
             cost = np.minimum((seconds + self.decision_s) / arrival, 1e9)  # finite, for interpolation
         self.shortest_s = cost.min(axis=1)[self._row]  # (K,) c_k from the best place
         self._tables = np.stack([seconds, arrival, cost])  # (3, sizes, _TABLE)
