@@ -124,7 +124,7 @@ def test_parity_of_candidates_that_are_re_ranked(tmp_path: Path) -> None:
     agree(expected, Policy(tmp_path / "policy.onnx").decide(arrays(seen), drawn.numpy()))
 
 
-@pytest.mark.parametrize("settings", [{}, {"choice_prior": 1.0}, {"greedy_choice": False}])
+@pytest.mark.parametrize("settings", [{}, {"choice_prior": 1.0, "shortest_move": 0.1}, {"greedy_choice": False}])
 def test_parity_of_the_null_action(settings: dict[str, Any], tmp_path: Path) -> None:
     made = agent("diffusion_sac", "devices", null_candidate=True, **settings)
     assert isinstance(made, DiffusionSac)

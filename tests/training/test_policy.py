@@ -82,6 +82,8 @@ def test_a_decision_is_changed_at_loading_where_the_agent_can(tmp_path: Path) ->
     assert held.config.null_candidate  # type: ignore[attr-defined]  # of this agent
     alone = load_policy(tmp_path / "sac", SCENARIO, Decision(greedy_choice=False)).agent
     assert not alone.config.greedy_choice  # type: ignore[attr-defined]  # as above
+    far = load_policy(tmp_path / "sac", SCENARIO, Decision(shortest_move=0.3)).agent
+    assert far.config.shortest_move == 0.3  # type: ignore[attr-defined]  # as above
     saved(tmp_path / "iql", "iql", "devices")
     with pytest.raises(ConfigError, match="candidates = 4, allowed for agents that re-rank; not for iql"):
         load_policy(tmp_path / "iql", SCENARIO, Decision(candidates=4))

@@ -68,8 +68,18 @@ def test_by_the_second_no_level_is_pinned_and_advantages_are_learned() -> None:
     config = preset("diffusion_sac", "default")
     found = for_scenario(config, PER_SECOND)
     assert isinstance(config, DiffusionSacConfig) and isinstance(found, DiffusionSacConfig)
-    assert (config.pinned_level, config.advantage_weight, config.choice_prior) == (True, 0.0, 1.0)
-    assert (found.pinned_level, found.advantage_weight, found.choice_prior) == (False, 0.9, 0.0)
+    assert (config.pinned_level, config.advantage_weight, config.choice_prior, config.shortest_move) == (
+        True,
+        0.0,
+        1.0,
+        0.04,
+    )
+    assert (found.pinned_level, found.advantage_weight, found.choice_prior, found.shortest_move) == (
+        False,
+        0.9,
+        0.0,
+        0.0,
+    )
 
 
 def test_settings_that_are_of_seconds_or_chosen_by_hand_stay() -> None:

@@ -62,6 +62,7 @@ PRESETS: dict[str, dict[str, Offline]] = {
             reward=RewardConfig(clip=10.0),
             choice_prior=1.0,
             null_candidate=True,
+            shortest_move=0.04,  # twice the final action noise
         ),
         "paper": DiffusionSacConfig(
             network=_PAPER_NETWORK,

@@ -24,6 +24,7 @@ SETTINGS = (
     "null_candidate=true|false",
     "greedy_choice=true|false",
     "choice_prior=X",
+    "shortest_move=X",
     "solver=ddim|dpm",
     "steps=N",
 )

@@ -47,6 +47,13 @@ class Decision(BaseModel):
         allow_inf_nan=False,
         description="weight of the actor's own opinion where the critic says whom to serve",
     )
+    shortest_move: float | None = Field(
+        None,
+        ge=0,
+        lt=1,
+        allow_inf_nan=False,
+        description="share of the longest move; a shorter one is held",
+    )
     solver: SolverName | None = Field(None, description="ddim without noise, or dpm: DPM-Solver++(2M)")
     steps: int | None = Field(None, ge=1, description="of the solver, at most M; by default M")
 
@@ -70,6 +77,7 @@ class Decision(BaseModel):
             ("null_candidate", "Diffusion-SAC"),
             ("greedy_choice", "Diffusion-SAC"),
             ("choice_prior", "Diffusion-SAC"),
+            ("shortest_move", "Diffusion-SAC"),
         ):
             value = getattr(self, setting)
             if value is None:
