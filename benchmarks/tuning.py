@@ -27,7 +27,7 @@ SEEDS = (100, 101, 102)  # of training, none of the comparison's
 WORKERS = 2
 BASE = "as set"  # before this was run; the best of each are the defaults now
 START: dict[str, dict[str, Any]] = {
-    OURS: {"null_candidate": False, "choice_prior": 0.0, "shortest_move": 0.0},
+    OURS: {"null_candidate": False, "choice_prior": 0.0},
     "CQL": {"discount": 0.99, "polyak": 0.03, "cql_weight": 0.5, "huber": 1.0, "reward": {"clip": 6.0}},
     "IQL": {"inverse_temperature": 3.0, "learning_rate": 1e-3},
     "BCQ": {"discount": 0.99, "polyak": 0.03},

@@ -331,40 +331,20 @@ def test_a_chain_that_is_believed_above_all_chooses_alone_but_for_ties(kind: Kin
     assert len(choice.unique()) > 1
 
 
-@pytest.mark.parametrize("deterministic", [False, True])
-@pytest.mark.parametrize("settings", [{}, {"candidates": 3}, {"greedy_choice": False}, {"null_candidate": True}])
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_move_shorter_than_the_shortest_is_held_and_a_longer_one_is_flown_as_it_is(
-    kind: Kind, settings: dict[str, Any], deterministic: bool
+@ALL
+def test_what_is_flown_of_a_move_shorter_than_the_shortest_is_nothing_and_of_a_longer_one_all(
+    name: str, kind: Kind
 ) -> None:
-    made, seen = diffusion_sac(kind, **settings), observation(kind, 200)
-    disturb(made.actor.average, 8)
-    free = made.act(seen, generator=generator(1), deterministic=deterministic)
-    length = free.continuous.norm(dim=1)
+    made = agent(name, kind)
+    decided = made.act(observation(kind, 200), generator=generator())
+    assert torch.equal(made.to_fly(decided).continuous, decided.continuous)
+    length = decided.continuous.norm(dim=1)
     middle = float(length.median())
     made.config = made.config.model_copy(update={"shortest_move": middle})
-    action = made.act(seen, generator=generator(1), deterministic=deterministic)
-    kept = action.continuous.norm(dim=1)
-    assert (kept == 0).any()
-    assert ((kept == 0) | (kept >= middle)).all()
-    if "candidates" not in settings:  # another of several may be the best once the short ones stand still
-        same = kept > 0
-        assert same.any()
-        assert torch.equal(action.continuous[same], free.continuous[same])
-        assert torch.equal(action.choice[same], free.choice[same])
-    assert torch.equal(made.decide(seen, None).continuous.norm(dim=1) == 0, kept == 0) or not deterministic
-
-
-def test_a_held_move_is_judged_where_it_stays() -> None:
-    """The critic chooses for w = 0, not for the drift that is not flown."""
-    made, seen = diffusion_sac("mlp", shortest_move=0.99), observation("mlp", 200)
-    disturb(made.actor.average, 8)
-    action = made.act(seen, generator=generator(1), deterministic=True)
-    still = (action.continuous == 0).all(dim=1)
-    with torch.no_grad():
-        q = made.critic.all_choices(made.critic.encode(seen), torch.zeros(200, 2)).amin(dim=0)
-    assert still.any()
-    assert torch.equal(action.choice[still], q.argmax(dim=1)[still])
+    flown = made.to_fly(decided)
+    wanted = torch.where((length >= middle)[:, None], decided.continuous, 0.0)
+    assert torch.equal(flown.continuous, wanted)
+    assert torch.equal(flown.choice, decided.choice)
 
 
 def test_a_padded_device_does_not_widen_the_deviation() -> None:

@@ -39,6 +39,7 @@ def test_a_teacher_gets_a_student(runs: Path, tmp_path: Path, capsys: pytest.Cap
     assert f"20 updates; policy of one step in {out}" in capsys.readouterr().out
     teacher, student = (load_policy(run, small_scenario()).agent for run in (runs / "diffusion_sac", out))
     assert isinstance(student, OneStep)
+    assert student.config.shortest_move == teacher.config.shortest_move > 0
     kept, learned = teacher.networks.state_dict(), student.networks.state_dict()
     for name, value in learned.items():
         part, _, rest = name.partition(".")

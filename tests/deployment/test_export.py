@@ -101,6 +101,22 @@ def test_parity_of_samples(name: str, kind: Kind, exported: Exported) -> None:
     agree(expected, policy.decide(arrays(seen), drawn.numpy()))
 
 
+@pytest.mark.parametrize("name", ["diffusion_sac", "cql"])
+def test_an_exported_policy_holds_the_moves_that_the_flown_one_holds(name: str, tmp_path: Path) -> None:
+    made, seen = agent(name, "devices"), observation("devices", 500)
+    disturb(made.networks, 7, 0.2)
+    decided = made.act(seen, generator=torch.Generator(), deterministic=True)
+    length = decided.continuous.norm(dim=1).unique()
+    gap = length.diff().argmax()
+    middle = float(length[gap : gap + 2].mean())  # between two lengths: rounding moves none over it
+    made.config = made.config.model_copy(update={"shortest_move": middle})
+    export(made, RELEASED, tmp_path / "policy.onnx")
+    flown = made.to_fly(decided)
+    held = (flown.continuous == 0).all(dim=1) & (decided.continuous != 0).any(dim=1)
+    assert 0 < held.sum() < 500
+    agree(flown, Policy(tmp_path / "policy.onnx").decide(arrays(seen)))
+
+
 def test_parity_of_a_student_that_chooses(tmp_path: Path) -> None:
     teacher = agent("diffusion_sac", "devices", null_candidate=True).config
     made = agent("one_step", "devices", teacher=teacher, width=16, choice="student")
@@ -124,7 +140,7 @@ def test_parity_of_candidates_that_are_re_ranked(tmp_path: Path) -> None:
     agree(expected, Policy(tmp_path / "policy.onnx").decide(arrays(seen), drawn.numpy()))
 
 
-@pytest.mark.parametrize("settings", [{}, {"choice_prior": 1.0, "shortest_move": 0.1}, {"greedy_choice": False}])
+@pytest.mark.parametrize("settings", [{}, {"choice_prior": 1.0}, {"greedy_choice": False}])
 def test_parity_of_the_null_action(settings: dict[str, Any], tmp_path: Path) -> None:
     made = agent("diffusion_sac", "devices", null_candidate=True, **settings)
     assert isinstance(made, DiffusionSac)

@@ -51,6 +51,12 @@ def test_sweeps_are_shorter_than_the_headline_and_every_line_of_one_as_long() ->
         assert lengths <= {4_000 if headline or name.endswith("published") else 2_000}, name
 
 
+def test_no_algorithm_has_its_drift_held_where_algorithms_meet() -> None:
+    assert preset("diffusion_sac", "default").shortest_move == 0.04
+    for name, runs in wanted(SCALES["standard"]).items():
+        assert all(run.settings["shortest_move"] == 0 for run in runs if run.problem != "policy"), name
+
+
 def test_as_published_means_the_papers_settings_and_a_sampled_action() -> None:
     for run in STANDARD.comparison(PROTOCOLS["published"]):
         setting = Setting.model_validate(run.options)

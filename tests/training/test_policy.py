@@ -52,6 +52,19 @@ def test_a_loaded_policy_flies_as_the_one_that_was_saved(tmp_path: Path, name: s
     assert trained_scenario(tmp_path) == SCENARIO
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_a_policy_does_not_fly_what_is_shorter_than_its_shortest_move(tmp_path: Path, name: str) -> None:
+    policy, given = saved(tmp_path, name, "devices"), seen("devices", 200)
+    every = policy.act(given, generator=np.random.default_rng(1)).displacement_m
+    length = np.linalg.norm(every, axis=1)
+    middle_m = np.sort(length)[99:101].mean()
+    share = middle_m / SCENARIO.airframe.max_displacement_m
+    policy.agent.config = policy.agent.config.model_copy(update={"shortest_move": share})
+    found = policy.act(given, generator=np.random.default_rng(1)).displacement_m
+    assert (found == np.where((length > middle_m)[:, None], every, 0.0)).all()
+    assert (found == 0).all(axis=1).sum() >= 50
+
+
 def test_a_displacement_keeps_its_metres_wherever_it_is_flown(tmp_path: Path) -> None:
     far = SCENARIO.replace(max_displacement_m=50.0)
     policy = saved(tmp_path, "gaussian_bc", "devices", far)
@@ -83,7 +96,7 @@ def test_a_decision_is_changed_at_loading_where_the_agent_can(tmp_path: Path) ->
     alone = load_policy(tmp_path / "sac", SCENARIO, Decision(greedy_choice=False)).agent
     assert not alone.config.greedy_choice  # type: ignore[attr-defined]  # as above
     far = load_policy(tmp_path / "sac", SCENARIO, Decision(shortest_move=0.3)).agent
-    assert far.config.shortest_move == 0.3  # type: ignore[attr-defined]  # as above
+    assert far.config.shortest_move == 0.3
     saved(tmp_path / "iql", "iql", "devices")
     with pytest.raises(ConfigError, match="candidates = 4, allowed for agents that re-rank; not for iql"):
         load_policy(tmp_path / "iql", SCENARIO, Decision(candidates=4))

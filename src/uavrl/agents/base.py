@@ -102,6 +102,13 @@ class AgentConfig(BaseModel):
         "variance; none: squared, as in the paper",
     )
     gradient_clip: float | None = Field(10.0, gt=0, description="largest gradient norm of a network")
+    shortest_move: float = Field(
+        0.0,
+        ge=0,
+        lt=1,
+        description="where a policy is flown a w shorter than this is held, w = 0: no network gives w = 0, and where "
+        "noise blurs Q a drift costs next to nothing; flown, every metre costs. Learning knows nothing of it",
+    )
 
 
 class Agent(ABC):
@@ -122,6 +129,13 @@ class Agent(ABC):
     @abstractmethod
     def act(self, observation: Observation, *, generator: torch.Generator, deterministic: bool = False) -> HybridAction:
         """Actions for B observations."""
+
+    def to_fly(self, action: HybridAction) -> HybridAction:
+        """Decided actions (N) as a policy flies them, see `AgentConfig.shortest_move`."""
+        if self.config.shortest_move == 0:
+            return action
+        length = action.continuous.square().sum(dim=1, keepdim=True).sqrt()
+        return action._replace(continuous=action.continuous * (length >= self.config.shortest_move))
 
     @abstractmethod
     def noise_shape(self, choices: int) -> tuple[int, int]:

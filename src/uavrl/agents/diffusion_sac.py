@@ -11,8 +11,7 @@ where [w, z] is what the denoising chain returns. The guidance must reach the ac
 and for z alike: an argmax or a sampler without graph would leave nothing but behaviour cloning.
 
 Beyond the paper: `action_noise` on w in the backup and in L_g, `pinned_level`, `advantage_weight` and `greedy_choice`
-in the backup, the penalty over choices alone; at a decision the null action among the candidates, `choice_prior` and
-`shortest_move`.
+in the backup, the penalty over choices alone; at a decision the null action among the candidates, and `choice_prior`.
 """
 
 from __future__ import annotations
@@ -131,13 +130,6 @@ class DiffusionSacConfig(AgentConfig):
         "network hits: of a move's cost the first metre is as dear as the last; who idles at a decision holds its "
         "place. Not in the backup",
     )
-    shortest_move: float = Field(
-        0.0,
-        ge=0,
-        lt=1,
-        description="a w shorter than this is held, w = 0, at a decision: under action noise, where L_g asks for Q, a "
-        "drift of the noise's size costs next to nothing; flown, every metre costs. Not in the backup",
-    )
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -160,14 +152,6 @@ class DiffusionSacConfig(AgentConfig):
 def held(action: HybridAction) -> HybridAction:
     """Actions (N) with w = 0, which no network hits, where the choice is 0: who idles holds its place."""
     return action._replace(continuous=action.continuous * (action.choice > 0)[:, None])
-
-
-def without_drift(action: HybridAction, shortest_move: float) -> HybridAction:
-    """Actions (N) with w = 0 where w is shorter than `shortest_move`."""
-    if shortest_move == 0:
-        return action
-    length = action.continuous.square().sum(dim=1, keepdim=True).sqrt()
-    return action._replace(continuous=action.continuous * (length >= shortest_move))
 
 
 def _prior_unit(every: Tensor, trained: int) -> Tensor:
@@ -400,11 +384,10 @@ class DiffusionSac(Agent):
     def best(self, observation: Observation, vector: Tensor, count: int) -> HybridAction:
         """Of each row's `count` chain outputs (C + D), in turn, the best by min Q, its choice as configured.
 
-        A candidate shorter than `shortest_move` is held, then judged. With `choice_prior` the chain's entries count
-        beside Q in every comparison: of choices, candidates, null action.
+        With `choice_prior` the chain's entries count beside Q in every comparison: of choices, candidates, null action.
         """
         config, continuous = self.config, self.spaces.continuous
-        drawn = without_drift(decode(vector, continuous), config.shortest_move)
+        drawn = decode(vector, continuous)
         if count == 1 and not config.greedy_choice:
             return held(drawn) if config.null_candidate else drawn
         rows = vector.shape[0] // count

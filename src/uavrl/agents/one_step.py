@@ -22,7 +22,7 @@ from torch.nn import functional
 from uavrl.actions import HybridAction, decode
 from uavrl.agents.base import Agent, AgentConfig, Batch, Metrics, adam, minimise, move_towards
 from uavrl.agents.diffusion_actor import block_mean
-from uavrl.agents.diffusion_sac import DiffusionSac, DiffusionSacConfig, held, without_drift
+from uavrl.agents.diffusion_sac import DiffusionSac, DiffusionSacConfig, held
 from uavrl.networks import Denoiser, Observation, Spaces, make_denoiser, repeat
 from uavrl.networks.interfaces import Context
 
@@ -151,7 +151,7 @@ class OneStep(Agent):
         vector = self.average.possible(context, self.map(self.average, context, start))
         if self.config.choice == "critic":
             return self.teacher.best(observation, vector, count)
-        answer = without_drift(decode(vector, self.spaces.continuous), self.config.teacher.shortest_move)
+        answer = decode(vector, self.spaces.continuous)
         return held(answer) if self.config.teacher.null_candidate else answer
 
     @torch.no_grad()

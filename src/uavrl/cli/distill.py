@@ -55,7 +55,8 @@ class Distill:
             agent = checkpoint.document["agent"]
             raise ConfigError(f"'{self.checkpoint}' is of agent '{agent}', allowed: diffusion_sac")
         transitions, scenario = load_source(self.data, trained_scenario(place))
-        shared = {name: getattr(teacher.config, name) for name in ("network", "reward", "batch_size")}
+        alike = ("network", "reward", "batch_size", "shortest_move")
+        shared = {name: getattr(teacher.config, name) for name in alike}
         student = with_settings(OneStepConfig(teacher=teacher.config, **shared), self.set)
         for part in ("network", "diffusion"):  # with another it would not be the trained one
             if getattr(student.teacher, part) != getattr(teacher.config, part):

@@ -42,7 +42,7 @@ class _Decision(nn.Module):
         """(observation[, noise]) or (uav, devices[, noise]) -> displacements (B, 2) (m), devices (B,)."""
         given, noise = (inputs[:-1], inputs[-1]) if self.sampled else (inputs, None)
         observation: Observation = given[0] if len(given) == 1 else {"uav": given[0], "devices": given[1]}
-        action = self.agent.decide(observation, noise)
+        action = self.agent.to_fly(self.agent.decide(observation, noise))
         return action.continuous * self.reach_m, action.choice
 
 

@@ -53,7 +53,7 @@ CLAIMS: tuple[Claim, ...] = (
         judges.readings(*(judges.beats(figure, "return", 1.0, BASELINES, "") for figure in _COMPARISONS)),
         "what the published settings lack: docs/what-matters.md. Under scenario paper energy outweighs age 2 to 1 "
         "at a good hover, so idling pays (docs/model.md). Under realistic our preset learns slowly: after 12,000 "
-        "updates three seeds of four are clear of TDM (results/realistic)",
+        "updates four seeds of five are clear of TDM (results/realistic)",
     ),
     Claim(
         "Diffusion-SAC has the lowest age",

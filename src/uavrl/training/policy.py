@@ -77,7 +77,7 @@ class Decision(BaseModel):
             ("null_candidate", "Diffusion-SAC"),
             ("greedy_choice", "Diffusion-SAC"),
             ("choice_prior", "Diffusion-SAC"),
-            ("shortest_move", "Diffusion-SAC"),
+            ("shortest_move", "every agent"),
         ):
             value = getattr(self, setting)
             if value is None:
@@ -131,7 +131,8 @@ class AgentPolicy:
             raise ConfigError(f"policy '{self.name}' has candidates to choose from, allowed: without --deterministic")
         device = next(self.agent.networks.parameters()).device
         draws = torch.Generator(device).manual_seed(int(generator.integers(2**62)))
-        action = self.agent.act(to_tensors(observation, device), generator=draws, deterministic=deterministic)
+        seen = to_tensors(observation, device)
+        action = self.agent.to_fly(self.agent.act(seen, generator=draws, deterministic=deterministic))
         return FlightAction(action.continuous.double().cpu().numpy() * self.reach_m, action.choice.cpu().numpy())
 
 

@@ -26,9 +26,9 @@ def for_scenario(config: Config, scenario: Scenario, chosen: Sequence[str] = ())
     Under a reward per second the discount is gamma^duration (a semi-Markov decision process) of as long a horizon for
     steps of `STEP_S`, at most that of `MOST_DISCOUNT`, and rewards, which shrink with the step, are scaled up to what a
     step of the other objective is worth. A level that a minibatch pins is too noisy to be charged by the second: it is
-    not pinned. Diffusion-SAC has `ADVANTAGE_WEIGHT`, believes its critic alone and flies its shortest moves, too. Under
-    any objective that is none of `TRIED` an offline algorithm's rewards get their scale from the log ("robust"); an
-    online one has no log to take it from.
+    not pinned. Every move is flown: steps are short there, and so are moves. Diffusion-SAC has `ADVANTAGE_WEIGHT` and
+    believes its critic alone. Under any objective that is none of `TRIED` an offline algorithm's rewards get their
+    scale from the log ("robust"); an online one has no log to take it from.
 
     Args:
         config: a preset.
@@ -50,10 +50,10 @@ def for_scenario(config: Config, scenario: Scenario, chosen: Sequence[str] = ())
             "discount": min(config.discount ** (1.0 / STEP_S), MOST_DISCOUNT),
             "discount_per": "second",
             "polyak": min(config.polyak, FASTEST_POLYAK),
+            "shortest_move": 0.0,
         }
         if isinstance(config, DiffusionSacConfig):
-            changes |= {"pinned_level": False, "advantage_weight": ADVANTAGE_WEIGHT}
-            changes |= {"choice_prior": 0.0, "shortest_move": 0.0}
+            changes |= {"pinned_level": False, "advantage_weight": ADVANTAGE_WEIGHT, "choice_prior": 0.0}
     if reward != config.reward:
         changes["reward"] = reward
     area, network = scenario.area, config.network
