@@ -1,7 +1,8 @@
 """Fewer denoising steps: what a decision costs in time, and what it loses, steps x solver x candidates, and a student.
 
     for s in 0 1 2 3 4; do
-      uavrl train diffusion_sac --out RUNS/teacher-$s --set diffusion.steps=50 --updates 4000 --seed $s
+      M50="--set diffusion.steps=50 --set shortest_move=0"
+      uavrl train diffusion_sac --out RUNS/teacher-$s $M50 --updates 4000 --seed $s
       uavrl distill RUNS/teacher-$s --out RUNS/student-$s --set teacher.greedy_choice=false --seed $s
     done
     python -m benchmarks.steps fly RUNS OUT [SEED ...]    # the evaluation's 100 layouts x 3 fadings

@@ -133,10 +133,25 @@ def test_a_device_out_of_reach_is_as_old_as_the_flight() -> None:
     assert step_mean_age_bound_s(never, 10) == pytest.approx(0.02 * 5.5)
 
 
+def test_a_device_that_hardly_ever_hears_hides_no_other_and_overflows_nothing() -> None:
+    nine, one = LOSSY.replace(devices=9), LOSSY.replace(devices=10, packet_bits=(*[2e6] * 9, 1e10))
+    assert float(mean_age_bound_s(one, 80.0)) == pytest.approx(0.9 * float(mean_age_bound_s(nine, 80.0)) + 4.0)
+    far = LOSSY.replace(fading="rayleigh", max_transmission_s=0.1)
+    layout = np.linspace(300.0, 1400.0, 45)[:, None, None] * np.array([1.0, 0.0]) + np.zeros((10, 1))
+    bounds = hover_age_bound_s(far, layout, np.zeros((45, 2)), 50.0)
+    assert (np.diff(bounds) >= -1e-9).all()
+    assert bounds[-1] == pytest.approx(25.0)  # all as old as the flight
+
+
 @pytest.mark.parametrize(
     ("overrides", "elapsed", "message"),
     [
         ({"fading": "rayleigh"}, 10.0, "channel.fading = 'rayleigh' without channel.max_transmission_s"),
+        (
+            {"fading": "rician", "max_transmission_s": 2.0, "rician_max_db": 30.0},
+            10.0,
+            "rician_max_db = 30: the bounds need",
+        ),
         ({"decision_time": "measured"}, 10.0, "airframe.decision_time = 'measured'"),
         ({"max_age_s": 5.0}, 10.0, "elapsed_s = 10, allowed: at most traffic.max_age_s = 5"),
         ({}, 0.0, "elapsed_s = 0, allowed"),

@@ -33,8 +33,8 @@ def test_each_run_changes_what_its_name_says_and_nothing_else(problem: str) -> N
         assert run.seed in (0, 1)
 
 
-def test_flights_start_from_the_default_preset() -> None:
-    assert BASES["fixed"] == preset("diffusion_sac", "default")
+def test_flights_start_from_the_default_preset_with_every_move_flown() -> None:
+    assert BASES["fixed"] == preset("diffusion_sac", "default").model_copy(update={"shortest_move": 0.0})
 
 
 def test_a_nested_change_keeps_its_neighbours() -> None:

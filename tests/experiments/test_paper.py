@@ -3,6 +3,7 @@ from __future__ import annotations
 import pytest
 
 from uavrl.agents.registry import preset
+from uavrl.experiments.ablation import BASES
 from uavrl.experiments.flights import Setting
 from uavrl.experiments.paper import (
     ALGORITHMS,
@@ -53,6 +54,7 @@ def test_sweeps_are_shorter_than_the_headline_and_every_line_of_one_as_long() ->
 
 def test_no_algorithm_has_its_drift_held_where_algorithms_meet() -> None:
     assert preset("diffusion_sac", "default").shortest_move == 0.04
+    assert BASES["fixed"].shortest_move == 0
     for name, runs in wanted(SCALES["standard"]).items():
         assert all(run.settings["shortest_move"] == 0 for run in runs if run.problem != "policy"), name
 

@@ -32,7 +32,8 @@ def test_rewards_of_other_units_get_their_scale_from_the_log_for_every_algorithm
     for scenario in (load_scenario("paper"), load_scenario("released", age_weight=0.9)):
         found = for_scenario(config, scenario)
         assert found.reward == config.reward.model_copy(update={"transform": "robust"})
-        assert found.model_copy(update={"reward": config.reward}) == config
+        alike = {"reward": config.reward, "shortest_move": config.shortest_move}
+        assert found.model_copy(update=alike) == config
 
 
 def test_rewards_a_second_of_other_units_are_not_scaled_twice() -> None:
@@ -68,18 +69,17 @@ def test_by_the_second_no_level_is_pinned_and_advantages_are_learned() -> None:
     config = preset("diffusion_sac", "default")
     found = for_scenario(config, PER_SECOND)
     assert isinstance(config, DiffusionSacConfig) and isinstance(found, DiffusionSacConfig)
-    assert (config.pinned_level, config.advantage_weight, config.choice_prior, config.shortest_move) == (
-        True,
-        0.0,
-        1.0,
-        0.04,
-    )
-    assert (found.pinned_level, found.advantage_weight, found.choice_prior, found.shortest_move) == (
-        False,
-        0.9,
-        0.0,
-        0.0,
-    )
+    assert (config.pinned_level, config.advantage_weight, config.choice_prior) == (True, 0.0, 1.0)
+    assert (found.pinned_level, found.advantage_weight, found.choice_prior) == (False, 0.9, 0.0)
+
+
+def test_short_moves_are_held_under_the_objective_where_that_was_tried_or_where_it_is_asked_for() -> None:
+    config = preset("diffusion_sac", "default")
+    assert for_scenario(config, load_scenario("released", devices=20)).shortest_move == config.shortest_move == 0.04
+    for scenario in (load_scenario("paper"), PER_SECOND):
+        assert for_scenario(config, scenario).shortest_move == 0
+        assert for_scenario(config, scenario, ["discount_per=second"]).shortest_move == 0
+        assert for_scenario(config, scenario, ["shortest_move=0.04"]).shortest_move == 0.04
 
 
 def test_settings_that_are_of_seconds_or_chosen_by_hand_stay() -> None:

@@ -106,8 +106,7 @@ class AgentConfig(BaseModel):
         0.0,
         ge=0,
         lt=1,
-        description="where a policy is flown a w shorter than this is held, w = 0: no network gives w = 0, and where "
-        "noise blurs Q a drift costs next to nothing; flown, every metre costs. Learning knows nothing of it",
+        description="a w shorter than this is not flown (w = 0), which no network hits; learning does not know of it",
     )
 
 

@@ -56,6 +56,7 @@ def settings(case: Case) -> DiffusionSacConfig | OneStepConfig:
     if case.steps == 1:
         choice = "critic" if case.critic else "student"
         student = {"teacher": config.model_dump(), "network": config.network, "choice": choice}
+        student["shortest_move"] = config.shortest_move
         return OneStepConfig.model_validate(student)
     return changed(config, {"diffusion": {"steps": case.steps}, "greedy_choice": case.critic})  # type: ignore[return-value]  # of its own type
 

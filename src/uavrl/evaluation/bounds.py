@@ -16,6 +16,8 @@ from uavrl.policies.service import service_model
 from uavrl.scenario import Scenario
 
 Float = NDArray[np.float64]
+_FAR_S = 1e6  # a device that takes longer to reach counts apart from the others, whose share it would take
+_LARGEST_FACTOR_DB = 20.0  # above it `expected_service` counts Rician factors as this one
 
 
 def service_s(scenario: Scenario, horizontal_m: ArrayLike) -> Float:
@@ -32,6 +34,9 @@ def service_s(scenario: Scenario, horizontal_m: ArrayLike) -> Float:
             f"channel.fading = {link.fading!r} without channel.max_transmission_s: "
             "the bounds need 'none', 'ergodic' or that limit"
         )
+    if link.fading == "rician" and max(link.rician_min_db, link.rician_max_db) > _LARGEST_FACTOR_DB:
+        most_db = max(link.rician_min_db, link.rician_max_db)
+        raise ConfigError(f"channel.rician_max_db = {most_db:g}: the bounds need at most {_LARGEST_FACTOR_DB:g}")
     if scenario.airframe.decision_time != "fixed":
         raise ConfigError(f"airframe.decision_time = {scenario.airframe.decision_time!r}: the bounds need 'fixed'")
     bits = np.array(scenario.traffic.packet_bits_each)
@@ -57,13 +62,14 @@ def _time_bound_s(scenario: Scenario, service: Float, elapsed_s: ArrayLike) -> F
             f"{scenario.traffic.max_age_s:g}, beyond which ages are clipped"
         )
     priority = np.array(scenario.traffic.priority_each)
-    can = np.isfinite(service)
-    finite = np.where(can, service, 0.0)
-    root = np.sqrt(priority * finite).sum(axis=-1)
-    never = np.where(can, 0.0, priority).sum(axis=-1)
     longest = scenario.channel.max_transmission_s
     late = longest + scenario.airframe.decision_s if longest is not None and fades(scenario) else 0.0
-    bound: Float = 0.5 * elapsed * (root**2 / (elapsed + late + finite.sum(axis=-1)) + never)
+    far = service > _FAR_S
+    near = np.where(far, 0.0, service)
+    root = np.sqrt(priority * near).sum(axis=-1)
+    served = np.where(far, (elapsed + late)[..., None] / service, 0.0)  # at most so many times
+    apart = np.where(far, priority / (1.0 + served), 0.0).sum(axis=-1)
+    bound: Float = 0.5 * elapsed * (root**2 / (elapsed + late + near.sum(axis=-1)) + apart)
     return bound
 
 

@@ -255,16 +255,15 @@ def _least_age_s(scenario: Scenario) -> str | None:
     None where no bound is known.
     """
     steps, time_s = scenario.limits.max_steps, scenario.limits.time_budget_s
-    if scenario.airframe.decision_time != "fixed":
-        return None
-    if fades(scenario) and (steps is not None or scenario.channel.max_transmission_s is None):
-        return None
     shares = sum(scenario.traffic.priority_each)  # tables weigh ages by shares of the priorities
-    if steps is not None:
-        return f"{step_mean_age_bound_s(scenario, steps) / shares:.3f} s a step over {steps} steps"
-    assert time_s is not None  # noqa: S101  # a scenario has one limit or the other
-    time_s = min(time_s, scenario.traffic.max_age_s)
-    return f"{float(mean_age_bound_s(scenario, time_s)) / shares:.3f} s a second over {time_s:g} s"
+    try:
+        if steps is not None:
+            return f"{step_mean_age_bound_s(scenario, steps) / shares:.3f} s a step over {steps} steps"
+        assert time_s is not None  # noqa: S101  # a scenario has one limit or the other
+        time_s = min(time_s, scenario.traffic.max_age_s)
+        return f"{float(mean_age_bound_s(scenario, time_s)) / shares:.3f} s a second over {time_s:g} s"
+    except ConfigError:  # of random or measured service times
+        return None
 
 
 def returns_of_duty(scenario: Scenario, every: Sequence[int]) -> list[float]:

@@ -34,7 +34,7 @@ BANDIT = DiffusionSacConfig(
     greedy_choice=False,
     action_noise=0.0,
 )
-FLIGHT = cast(DiffusionSacConfig, preset("diffusion_sac", "default"))
+FLIGHT = cast(DiffusionSacConfig, changed(preset("diffusion_sac", "default"), {"shortest_move": 0.0}))  # all is flown
 BASES = {"bandit": BANDIT, "fixed": FLIGHT}
 UPDATES = {"bandit": 2_500, "fixed": 2_000}
 

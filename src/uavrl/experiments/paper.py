@@ -158,7 +158,7 @@ class Plan:
         agent = changed(preset(ALGORITHMS[algorithm], protocol.preset), every)
         if protocol.preset == "default":
             agent = for_scenario(agent, protocol.scenario)
-        agent = changed(agent, {"shortest_move": 0.0})  # algorithms meet as they decide: results/layouts has it apart
+        agent = changed(agent, {"shortest_move": 0.0})  # compared with every move flown; held: results/layouts
         settings = agent.model_dump(mode="json")
         rows = Data(**{"name": protocol.data, "size": self.size, **(data or {})})
         options = self._setting(protocol, rows, protocol.deterministic(algorithm), curve)

@@ -52,7 +52,7 @@ class Decision(BaseModel):
         ge=0,
         lt=1,
         allow_inf_nan=False,
-        description="share of the longest move; a shorter one is held",
+        description="moves shorter than this share of the longest one are held",
     )
     solver: SolverName | None = Field(None, description="ddim without noise, or dpm: DPM-Solver++(2M)")
     steps: int | None = Field(None, ge=1, description="of the solver, at most M; by default M")
@@ -72,18 +72,14 @@ class Decision(BaseModel):
             ConfigError: the agent has no such part, or a chain of fewer steps.
         """
         name = agent.config.name  # type: ignore[attr-defined]  # every agent's own config names it
-        for setting, able in (
-            ("candidates", "agents that re-rank"),
-            ("null_candidate", "Diffusion-SAC"),
-            ("greedy_choice", "Diffusion-SAC"),
-            ("choice_prior", "Diffusion-SAC"),
-            ("shortest_move", "every agent"),
-        ):
+        able = dict.fromkeys(("null_candidate", "greedy_choice", "choice_prior"), "Diffusion-SAC")
+        able["candidates"] = "agents that re-rank"
+        for setting in (*able, "shortest_move"):  # which every agent has
             value = getattr(self, setting)
             if value is None:
                 continue
             if not hasattr(agent.config, setting):
-                raise ConfigError(f"{setting} = {value}, allowed for {able}; not for {name}")
+                raise ConfigError(f"{setting} = {value}, allowed for {able[setting]}; not for {name}")
             try:
                 agent.config = type(agent.config).model_validate(agent.config.model_dump() | {setting: value})
             except ValidationError as error:

@@ -14,6 +14,9 @@ STEP_S = 0.4  # mean duration of a step in the built-in logs of `released`, wher
 MOST_DISCOUNT, FASTEST_POLYAK = 0.99, 0.05  # a second; an update: docs/what-matters.md
 ADVANTAGE_WEIGHT = 0.9  # of Diffusion-SAC: a step changes little, and what it changes shows in later steps alone
 TRIED = tuple(load_scenario(name).objective for name in ("released", "realistic"))  # here scales were found by trials
+HELD = load_scenario(
+    "released"
+).objective  # under which holding short moves was tried; that of `realistic` pays for each
 
 Config = TypeVar("Config", bound=AgentConfig)
 
@@ -26,9 +29,9 @@ def for_scenario(config: Config, scenario: Scenario, chosen: Sequence[str] = ())
     Under a reward per second the discount is gamma^duration (a semi-Markov decision process) of as long a horizon for
     steps of `STEP_S`, at most that of `MOST_DISCOUNT`, and rewards, which shrink with the step, are scaled up to what a
     step of the other objective is worth. A level that a minibatch pins is too noisy to be charged by the second: it is
-    not pinned. Every move is flown: steps are short there, and so are moves. Diffusion-SAC has `ADVANTAGE_WEIGHT` and
-    believes its critic alone. Under any objective that is none of `TRIED` an offline algorithm's rewards get their
-    scale from the log ("robust"); an online one has no log to take it from.
+    not pinned. Diffusion-SAC has `ADVANTAGE_WEIGHT` and believes its critic alone. Under any objective that is none of
+    `TRIED` an offline algorithm's rewards get their scale from the log ("robust"); an online one has no log to take it
+    from. Short moves are held under the objective of `released` alone.
 
     Args:
         config: a preset.
@@ -50,12 +53,13 @@ def for_scenario(config: Config, scenario: Scenario, chosen: Sequence[str] = ())
             "discount": min(config.discount ** (1.0 / STEP_S), MOST_DISCOUNT),
             "discount_per": "second",
             "polyak": min(config.polyak, FASTEST_POLYAK),
-            "shortest_move": 0.0,
         }
         if isinstance(config, DiffusionSacConfig):
             changes |= {"pinned_level": False, "advantage_weight": ADVANTAGE_WEIGHT, "choice_prior": 0.0}
     if reward != config.reward:
         changes["reward"] = reward
+    if objective != HELD and config.shortest_move > 0 and "shortest_move" not in by_hand:
+        changes["shortest_move"] = 0.0
     area, network = scenario.area, config.network
     if network.kind == "devices":
         sizes = {"scale_m": 0.5 * max(area.width_m, area.depth_m), "reach_m": scenario.airframe.max_displacement_m}
