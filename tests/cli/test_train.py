@@ -343,6 +343,7 @@ def test_a_part_of_a_file_and_the_papers_settings(folder: Path) -> None:
             ["bc", "--out", "o", "--symmetry", "on", "--set", "network.kind=mlp"],
             ["symmetry = true", "'devices'", "'mlp'"],
         ),
+        (["bc", "--out", "o", "--relocate", "2"], ["relocation", "2", "less than or equal to 1"]),
         (["bc", "--out", "o", "--resume"], ["--resume", "holds no checkpoint"]),
         (["bc", "--out", "log.parquet"], ["--out", "log.parquet", "directory"]),
         (["bc", "--out", "log.parquet/run"], ["--out", "log.parquet/run", "directory"]),

@@ -126,9 +126,9 @@ def test_rows_are_turned_where_the_settings_say_so(kind: Any, per: Any, symmetry
     plan = TrainConfig(scenario=SQUARE, agent=agent, symmetry=symmetry)
     assert plan.turns is turns
     learner = OfflineLearner(plan, fly(SQUARE, steps=20))
-    rows, turn = learner.draw()
+    rows, turn, none = learner.draw()
     assert (turn is not None) is turns
-    plain, seen = leaves(learner.data.take(rows)), leaves(learner.encoded(rows, turn))
+    plain, seen = leaves(learner.data.take(rows)), leaves(learner.encoded(rows, turn, none))
     unequal = {name for name, value in seen.items() if not torch.equal(value, plain[name])}
     moving = {f"{when}observation.{what}" for when in ("", "next_") for what in ("uav", "devices")} | {"continuous"}
     assert unequal == (moving if turns else set())

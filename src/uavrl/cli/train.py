@@ -58,6 +58,9 @@ class Train:
     symmetry: Literal["auto", "on", "off"] = "auto"
     """mirror and turn each logged step at random, which the physics allows; auto: where a set network discounts by the
     second"""
+    relocate: float = 0.0
+    """share of the logged steps, drawn anew each time, whose devices lie elsewhere, but for the one that is served: the
+    physics allows it, and a log of one layout teaches others so"""
     device: Literal["cpu", "cuda"] = "cpu"
     """where to compute"""
     compile: Literal["none", "step", "graphs"] = "none"
@@ -97,6 +100,7 @@ class Train:
             log_every=min(LOG_EVERY, max(1, updates // 50)),  # enough rows to judge a short run by
             evaluate_every=self.evaluate_every,
             symmetry={"auto": None, "on": True, "off": False}[self.symmetry],
+            relocation=self.relocate,
             compilation=self.compile,
         )
         places = self._places(config)

@@ -40,6 +40,7 @@ from uavrl.training.health import Expected
 from uavrl.training.interrupts import held_interrupts
 from uavrl.training.log import MetricsLog, Reporter
 from uavrl.training.policy import AgentPolicy
+from uavrl.training.relocation import Relocation, relocated
 from uavrl.training.support import Support
 from uavrl.training.symmetry import Turn, turned
 
@@ -71,6 +72,13 @@ class TrainConfig(BaseModel):
         description="mirror and turn each row of a minibatch at random, as the physics allows; needs a set network. "
         "null: where it has one and discounts by the second",
     )
+    relocation: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="share of a minibatch whose devices, but for the one that is served, lie elsewhere, as the physics "
+        "allows; needs a set network",
+    )
     compilation: Compilation = Field("none", description="of the networks' passes, see `compile_passes`")
 
     @property
@@ -83,6 +91,10 @@ class TrainConfig(BaseModel):
     def _consistent(self) -> Self:
         if self.symmetry and self.agent.network.kind != "devices":
             raise ValueError(f"symmetry = true needs network.kind = 'devices', not {self.agent.network.kind!r}")
+        if self.relocation > 0 and self.agent.network.kind != "devices":
+            raise ValueError(
+                f"relocation = {self.relocation:g} needs network.kind = 'devices', not {self.agent.network.kind!r}"
+            )
         return self
 
 
@@ -190,15 +202,20 @@ class OfflineLearner:
         self.updates += 1
         return metrics
 
-    def draw(self) -> tuple[torch.Tensor, Turn | None]:
-        """Row numbers (B,) of a minibatch, and how each row is turned."""
-        count = self.agent.config.batch_size
-        rows = draw_rows(self.data, count, self.generator)
-        return rows, Turn.draw(count, self.config.scenario.area, self.generator) if self.config.turns else None
+    def draw(self) -> tuple[torch.Tensor, Turn | None, Relocation | None]:
+        """Row numbers (B,) of a minibatch, how each row is turned, and where its devices lie instead."""
+        config, generator = self.config, self.generator
+        count, area, devices = self.agent.config.batch_size, config.scenario.area, config.scenario.traffic.devices
+        rows = draw_rows(self.data, count, generator)
+        turn = Turn.draw(count, area, generator) if config.turns else None
+        share = config.relocation
+        return rows, turn, Relocation.draw(count, devices, area, share, generator) if share > 0 else None
 
-    def encoded(self, rows: torch.Tensor, turn: Turn | None) -> Batch:
+    def encoded(self, rows: torch.Tensor, turn: Turn | None, relocation: Relocation | None) -> Batch:
         """What the agent sees of these rows."""
         batch = self.data.take(rows)
+        if relocation is not None:
+            batch = relocated(batch, relocation)
         return batch if turn is None else turned(batch, turn, self.config.scenario.area)
 
     def support_distance(self) -> float:

@@ -14,6 +14,7 @@ from uavrl.errors import ConfigError
 from uavrl.training.log import Reporter
 from uavrl.training.offline import Evaluator, OfflineLearner, run_all
 from uavrl.training.policy import AgentPolicy
+from uavrl.training.relocation import Relocation
 from uavrl.training.symmetry import Turn
 
 
@@ -53,9 +54,12 @@ class StackedLearner:
         """One update of each on a minibatch of its own."""
         first = self.learners[0]
         first.begin_step()
-        rows, turns = zip(*(learner.draw() for learner in self.learners), strict=True)
+        rows, turns, relocations = zip(*(learner.draw() for learner in self.learners), strict=True)
         turn = None if turns[0] is None else Turn(*(torch.cat(parts) for parts in zip(*turns, strict=True)))
-        batches = first.encoded(torch.cat(rows), turn).grouped(len(self.learners))
+        relocation = None
+        if relocations[0] is not None:
+            relocation = Relocation(*(torch.cat(parts) for parts in zip(*relocations, strict=True)))
+        batches = first.encoded(torch.cat(rows), turn, relocation).grouped(len(self.learners))
         metrics = self.stack.update(batches, [learner.generator for learner in self.learners])
         for learner in self.learners:
             learner.updates += 1
