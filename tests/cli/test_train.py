@@ -304,6 +304,25 @@ def test_symmetry_is_a_setting_of_the_run(folder: Path, word: str, kept: bool | 
     assert load_checkpoint(folder / "run/checkpoint").document["train"]["symmetry"] is kept
 
 
+@pytest.mark.parametrize(
+    ("words", "share"),
+    [
+        (["diffusion_sac"], 0.5),
+        (["diffusion_sac", "--relocate", "0"], 0.0),
+        (["diffusion_sac", "--preset", "paper", "--set", "network.kind=devices"], 0.0),
+        (["bc"], 0.0),
+        (["bc", "--relocate", "0.25"], 0.25),
+    ],
+)
+def test_devices_are_moved_by_default_where_a_log_has_one_layout(folder: Path, words: list[str], share: float) -> None:
+    scenario = small_scenario()
+    save_flat(folder / "one.parquet", fly(scenario, steps=20, layout=np.full((3, 2), 300.0)), scenario)
+    assert train(*words, "--out", "run", "--data", "one.parquet", "--updates", "1", *SMALL) == 0
+    assert load_checkpoint(folder / "run/checkpoint").document["train"]["relocation"] == share
+    assert train("diffusion_sac", "--out", "many", "--data", "log.parquet", "--updates", "1", *SMALL) == 0
+    assert load_checkpoint(folder / "many/checkpoint").document["train"]["relocation"] == 0
+
+
 def test_a_part_of_a_file_and_the_papers_settings(folder: Path) -> None:
     words = ["diffusion_sac", "--out", "run", "--data", "log.parquet", "--size", "30", "--preset", "paper"]
     assert train(*words, "--updates", "1", *SMALL) == 0

@@ -5,9 +5,10 @@ import pytest
 from uavrl.agents.diffusion_sac import DiffusionSacConfig
 from uavrl.agents.registry import preset
 from uavrl.agents.sac import SacConfig
+from uavrl.datasets import load_builtin
 from uavrl.networks import NetworkConfig
 from uavrl.scenario import load_scenario
-from uavrl.training.scenario_settings import STEP_S, for_scenario
+from uavrl.training.scenario_settings import STEP_S, for_scenario, relocation_for
 
 PER_SECOND = load_scenario("realistic")
 
@@ -80,6 +81,16 @@ def test_short_moves_are_held_under_the_objective_where_that_was_tried_or_where_
         assert for_scenario(config, scenario).shortest_move == 0
         assert for_scenario(config, scenario, ["discount_per=second"]).shortest_move == 0
         assert for_scenario(config, scenario, ["shortest_move=0.04"]).shortest_move == 0.04
+
+
+def test_devices_are_moved_for_a_log_of_one_layout_that_diffusion_sac_learns_from() -> None:
+    config, released = preset("diffusion_sac", "default"), load_scenario("released")
+    one, many = load_builtin("fixed", 50), load_builtin("layouts", 50)
+    assert relocation_for(config, released, one) == 0.5
+    assert relocation_for(config, released, many) == 0
+    assert relocation_for(config, load_scenario("paper"), one) == 0
+    assert relocation_for(preset("cql", "default"), released, one) == 0
+    assert relocation_for(preset("diffusion_sac", "paper"), released, one) == 0  # a perceptron
 
 
 def test_settings_that_are_of_seconds_or_chosen_by_hand_stay() -> None:

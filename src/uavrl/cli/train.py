@@ -58,9 +58,9 @@ class Train:
     symmetry: Literal["auto", "on", "off"] = "auto"
     """mirror and turn each logged step at random, which the physics allows; auto: where a set network discounts by the
     second"""
-    relocate: float = 0.0
-    """share of the logged steps, drawn anew each time, whose devices lie elsewhere, but for the one that is served: the
-    physics allows it, and a log of one layout teaches others so"""
+    relocate: float | None = None
+    """share of the logged steps, drawn anew each time, whose devices lie elsewhere, but for the one that is served, as
+    the physics allows; by default 0.5 where diffusion_sac learns from a log of one layout, for released's objective"""
     device: Literal["cpu", "cuda"] = "cpu"
     """where to compute"""
     compile: Literal["none", "step", "graphs"] = "none"
@@ -77,7 +77,7 @@ class Train:
         from uavrl.datasets import builtin_names, load_source, select
         from uavrl.training.log import require_tensorboard
         from uavrl.training.offline import PRESET_UPDATES, TrainConfig
-        from uavrl.training.scenario_settings import for_scenario
+        from uavrl.training.scenario_settings import for_scenario, relocation_for
 
         if self.tensorboard:
             require_tensorboard()  # before anything that takes long
@@ -91,16 +91,20 @@ class Train:
         agent = preset(self.agent, self.preset)
         if self.preset == "default":
             agent = for_scenario(agent, scenario, self.set)
+        agent = with_settings(agent, self.set)
+        relocation = self.relocate
+        if relocation is None:
+            relocation = relocation_for(agent, scenario, transitions) if self.preset == "default" else 0.0
         config = pydantic_config(
             TrainConfig,
             scenario=scenario,
-            agent=with_settings(agent, self.set),
+            agent=agent,
             updates=updates,
             seed=self.seed,
             log_every=min(LOG_EVERY, max(1, updates // 50)),  # enough rows to judge a short run by
             evaluate_every=self.evaluate_every,
             symmetry={"auto": None, "on": True, "off": False}[self.symmetry],
-            relocation=self.relocate,
+            relocation=relocation,
             compilation=self.compile,
         )
         places = self._places(config)

@@ -1,4 +1,4 @@
-"""Settings that were found in `released`, for another scenario."""
+"""Settings that were found in `released`, for another scenario and for a log of one layout."""
 
 from __future__ import annotations
 
@@ -8,17 +8,31 @@ from typing import Any, TypeVar
 from uavrl.agents.base import AgentConfig
 from uavrl.agents.diffusion_sac import DiffusionSacConfig
 from uavrl.agents.sac import SacConfig
+from uavrl.datasets.mapped import MappedTransitions
+from uavrl.datasets.transitions import Transitions
 from uavrl.scenario import Scenario, load_scenario
+from uavrl.training.offline import SAMPLE_ROWS
 
 STEP_S = 0.4  # mean duration of a step in the built-in logs of `released`, where our presets were found
 MOST_DISCOUNT, FASTEST_POLYAK = 0.99, 0.05  # a second; an update: docs/what-matters.md
 ADVANTAGE_WEIGHT = 0.9  # of Diffusion-SAC: a step changes little, and what it changes shows in later steps alone
 TRIED = tuple(load_scenario(name).objective for name in ("released", "realistic"))  # here scales were found by trials
-HELD = load_scenario(
-    "released"
-).objective  # under which holding short moves was tried; that of `realistic` pays for each
+HELD = TRIED[0]  # under which holding short moves was tried; that of `realistic` is better off with all flown
+ONE_LAYOUT_RELOCATION = 0.5  # of Diffusion-SAC under the same objective
 
 Config = TypeVar("Config", bound=AgentConfig)
+
+
+def relocation_for(config: AgentConfig, scenario: Scenario, transitions: Transitions) -> float:
+    """`TrainConfig.relocation`: not 0 for Diffusion-SAC with a set network and a log of one layout, where it was tried.
+
+    Of mapped data `SAMPLE_ROWS` rows are looked at.
+    """
+    if not isinstance(config, DiffusionSacConfig) or config.network.kind != "devices" or scenario.objective != HELD:
+        return 0.0
+    known = transitions.sample(SAMPLE_ROWS) if isinstance(transitions, MappedTransitions) else transitions
+    alike = bool((known.layout_m == known.layout_m[:1]).all())
+    return ONE_LAYOUT_RELOCATION if alike else 0.0
 
 
 def for_scenario(config: Config, scenario: Scenario, chosen: Sequence[str] = ()) -> Config:
