@@ -64,7 +64,8 @@ def test_an_installed_policy_is_small_has_a_card_and_beats_tdm_on_trial_flights(
         policy.name: fly(policy, tests, deterministic=True)
         for policy in (load_policy(place, scenario), make_policy("tdm"))
     }
-    returns = {key: float((one.reward * one.active).sum(axis=0).mean()) for key, one in flown.items()}
+    # the median: one packet of minutes is most of a mean over ten flights
+    returns = {key: float(np.median((one.reward * one.active).sum(axis=0))) for key, one in flown.items()}
     assert returns["diffusion_sac"] > returns["tdm"] + (10.0 if name == "realistic" else 20.0)
 
 
