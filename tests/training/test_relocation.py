@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tests.datasets.flights import fly, small_scenario
 from tests.training.test_offline import config
-from tests.training.test_symmetry import leaves
+from tests.training.test_symmetry import leaves, train_stacked_as_alone
 from uavrl.datasets import Transitions
 from uavrl.simulation.dynamics import advance, initial_state
 from uavrl.simulation.environment import draw
@@ -17,7 +17,6 @@ from uavrl.simulation.state import FlightAction
 from uavrl.training.batches import to_batch
 from uavrl.training.offline import OfflineLearner
 from uavrl.training.relocation import Relocation, relocated
-from uavrl.training.stacked import StackedLearner
 
 OBLONG = small_scenario(depth_m=600.0)
 
@@ -83,11 +82,4 @@ def test_who_does_not_see_the_devices_is_refused() -> None:
 
 
 def test_relocated_rows_train_stacked_as_alone() -> None:
-    flown = fly(small_scenario(), steps=20)
-    alone, stacked = ([OfflineLearner(config(seed=seed, relocation=0.5), flown) for seed in (3, 4)] for _ in range(2))
-    stack = StackedLearner(stacked)
-    for _ in range(2):
-        expected, found = [learner.step() for learner in alone], stack.step()
-    for mine, theirs in zip(found, expected, strict=True):
-        values = {name: float(value) for name, value in theirs.items()}
-        assert {name: float(value) for name, value in mine.items()} == pytest.approx(values, rel=5e-3, abs=1e-3)
+    train_stacked_as_alone(relocation=0.5)
