@@ -17,7 +17,6 @@ from uavrl.scenario import Scenario
 
 Float = NDArray[np.float64]
 _FAR_S = 1e6  # a device that takes longer to reach counts apart from the others, whose share it would take
-_LARGEST_FACTOR_DB = 20.0  # above it `expected_service` counts Rician factors as this one
 
 
 def service_s(scenario: Scenario, horizontal_m: ArrayLike) -> Float:
@@ -34,9 +33,9 @@ def service_s(scenario: Scenario, horizontal_m: ArrayLike) -> Float:
             f"channel.fading = {link.fading!r} without channel.max_transmission_s: "
             "the bounds need 'none', 'ergodic' or that limit"
         )
-    if link.fading == "rician" and max(link.rician_min_db, link.rician_max_db) > _LARGEST_FACTOR_DB:
-        most_db = max(link.rician_min_db, link.rician_max_db)
-        raise ConfigError(f"channel.rician_max_db = {most_db:g}: the bounds need at most {_LARGEST_FACTOR_DB:g}")
+    highest_db, counted_db = max(link.rician_min_db, link.rician_max_db), 10.0 * np.log10(channel.LARGEST_FACTOR)
+    if link.fading == "rician" and highest_db > counted_db:  # what fades less is counted as if it faded so much
+        raise ConfigError(f"channel.rician_max_db = {highest_db:g}: the bounds need at most {counted_db:g}")
     if scenario.airframe.decision_time != "fixed":
         raise ConfigError(f"airframe.decision_time = {scenario.airframe.decision_time!r}: the bounds need 'fixed'")
     bits = np.array(scenario.traffic.packet_bits_each)

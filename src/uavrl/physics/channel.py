@@ -131,12 +131,14 @@ def link_snr(horizontal_m: Array, channel: Channel) -> tuple[Array, Array, Array
     return elevation, los, mean_snr(mean_path_loss_db(distance, los, channel), channel)
 
 
-# Nodes and weights of integrals over |h|^2 in u = ln |h|^2, and of the phase: errors under 1e-7 up to _LARGEST_FACTOR.
+# Nodes and weights of integrals over |h|^2 in u = ln |h|^2, and of the phase: errors under 1e-7 up to LARGEST_FACTOR.
 _LOG_POWER = np.linspace(-20.0, 4.2, 160)
 _POWER_NODES = np.exp(_LOG_POWER)
 _POWER_WEIGHTS = (_LOG_POWER[1] - _LOG_POWER[0]) * _POWER_NODES
 _PHASE_COSINES = np.cos((np.arange(48) + 0.5) * (np.pi / 48))
-_LARGEST_FACTOR = 100.0  # above 20 dB the power hardly fades, and narrower densities would need more nodes
+LARGEST_FACTOR = (
+    100.0  # of Rician fading: above 20 dB the power hardly fades, and narrower densities would need more nodes
+)
 
 
 def fading_density(power: Array, factor: Array) -> Array:
@@ -150,7 +152,7 @@ def fading_density(power: Array, factor: Array) -> Array:
         factor: (...) Rician factor K (ratio), of a shape that broadcasts.
     """
     xp = array_namespace(power)
-    factor = xp.clip(factor, 0.0, _LARGEST_FACTOR)[..., None]
+    factor = xp.clip(factor, 0.0, LARGEST_FACTOR)[..., None]
     root = xp.sqrt(power)[..., None]
     cosine = xp.asarray(_PHASE_COSINES, dtype=power.dtype, device=power.device)
     line = xp.sqrt(factor / (factor + 1.0))

@@ -24,7 +24,7 @@ class Relocation(NamedTuple):
 
     @classmethod
     def draw(cls, count: int, devices: int, area: Area, share: float, generator: torch.Generator) -> Relocation:
-        """Uniform places in the area for `share` of the rows."""
+        """For `count` rows of K = `devices`: uniform places in the area, taken by `share` of the rows in the mean."""
         size = torch.tensor([area.width_m, area.depth_m], device=generator.device)
         place_m = torch.rand((count, devices, 2), generator=generator, device=generator.device) * size
         return cls(place_m, torch.rand((count, 1), generator=generator, device=generator.device) < share)
@@ -38,8 +38,10 @@ def relocated(batch: Batch, relocation: Relocation) -> Batch:
     def seen(observation: Observation) -> Observation:
         if not isinstance(observation, dict):
             raise TypeError("only an observation of where the devices are can have them moved")
-        offset, rest = observation["devices"].split([2, observation["devices"].shape[2] - 2], dim=2)
+        there = observation["devices"]
         elsewhere = relocation.place_m - observation["uav"][:, None, :2]
-        return observation | {"devices": torch.cat([torch.where(moved, elsewhere, offset), rest], dim=2)}
+        return observation | {
+            "devices": torch.cat([torch.where(moved, elsewhere, there[..., :2]), there[..., 2:]], dim=2)
+        }
 
     return replace(batch, observation=seen(batch.observation), next_observation=seen(batch.next_observation))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 
@@ -16,6 +17,14 @@ from uavrl.training.offline import Evaluator, OfflineLearner, run_all
 from uavrl.training.policy import AgentPolicy
 from uavrl.training.relocation import Relocation
 from uavrl.training.symmetry import Turn
+
+Drawn = TypeVar("Drawn", Turn, Relocation)
+
+
+def _joined(drawn: Sequence[Drawn | None]) -> Drawn | None:
+    """What several learners drew, one after another; all of them have drawn such a thing, or none has."""
+    some = [one for one in drawn if one is not None]
+    return type(some[0])(*(torch.cat(parts) for parts in zip(*some, strict=True))) if some else None
 
 
 class StackedLearner:
@@ -55,11 +64,7 @@ class StackedLearner:
         first = self.learners[0]
         first.begin_step()
         rows, turns, relocations = zip(*(learner.draw() for learner in self.learners), strict=True)
-        turn = None if turns[0] is None else Turn(*(torch.cat(parts) for parts in zip(*turns, strict=True)))
-        relocation = None
-        if relocations[0] is not None:
-            relocation = Relocation(*(torch.cat(parts) for parts in zip(*relocations, strict=True)))
-        batches = first.encoded(torch.cat(rows), turn, relocation).grouped(len(self.learners))
+        batches = first.encoded(torch.cat(rows), _joined(turns), _joined(relocations)).grouped(len(self.learners))
         metrics = self.stack.update(batches, [learner.generator for learner in self.learners])
         for learner in self.learners:
             learner.updates += 1
